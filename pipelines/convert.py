@@ -508,8 +508,8 @@ def _write(
     progress: Progress,
 ) -> str:
     """Write the archive; returns the hash of its times and depths."""
-    from liex_lab.recordings.writer import McapDepthWriter
     from liex_lab.recordings.formats.messages.statements import PackFacts, hash_note
+    from liex_lab.recordings.writer import McapDepthWriter
 
     within = _within(mask)
     moved = opened.stamp_faults

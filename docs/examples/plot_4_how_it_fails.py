@@ -18,7 +18,8 @@ plan = liex_lab.Plan.load("mouse").with_settings(["replay.depth=false"])
 rows = {}
 for scene in ("plain", "bedding", "two-animals"):
     recording = liex_lab.open_recording(f"synthetic:scene?name={scene}&seed=5&frames={N}")
-    recording.files.take_digest(hashlib.sha256(scene.encode()).hexdigest())  # not rendered twice
+    # not rendered twice
+    recording.files.known_digest = hashlib.sha256(scene.encode()).hexdigest()
     try:
         folder = liex_lab.run_session(recording, plan, "results", overwrite=True)
     except liex_lab.LiexError as error:  # it is refused: the best way to fail

@@ -1,4 +1,4 @@
-"""Numba kernels: rectification, and the codecs RVL, 16z (OpenNI), LZF (PCL) and FFV1's CRC-32.
+"""Numba kernels: rectification, and the codecs RVL, 16z (OpenNI) and LZF (PCL).
 
 *Rectification* (table lookup, forward splatting with a z-buffer, hole closing) is serial and
 releases the GIL: the output is scattered over the image, and two threads in parallel cost more than
@@ -16,7 +16,7 @@ second step. A wide step is a byte from 0x80 on, counted from 192, or else a who
 bits, high byte first. The numbers are depths (`16zP`) or indices into a table of the frame's own
 depths (`16zT`). OpenNI's decoder is the reference.
 
-Slow twins: tests/oracles/oni.py, lzf.py and ffv1.py.
+Slow twins: tests/oracles/oni.py and lzf.py.
 """
 
 from __future__ import annotations
@@ -423,51 +423,6 @@ def unpack_16z(
         payload = payload[start:]
     depth = np.empty(n_pixels, np.float32)
     return depth if _oni_kernels_unpack(payload, table, depth) else None
-
-
-# CRC-32 of FFV1 slices (RFC 9043), numba kernels. Slow twin: tests/oracles/ffv1.py.
-
-
-@njit(cache=True)
-def crc_table():
-    """Table of CRC-32 remainders of every byte, polynomial 0x04C11DB7, high bit first (FFV1).
-
-    Returns:
-        (256,) uint32.
-    """
-    table = np.empty(256, np.uint32)
-    for byte in range(256):
-        rest = byte << 24
-        for _ in range(8):
-            rest = ((rest << 1) ^ 0x04C11DB7 if rest & 0x80000000 else rest << 1) & 0xFFFFFFFF
-        table[byte] = rest
-    return table
-
-
-@njit(cache=True)
-def slices_agree(data, table):
-    """Whether the slices of an image, found from its last byte backwards, match their CRC-32.
-
-    Each slice ends in its length (3 bytes), an error flag (1) and a check sum (4) that makes the
-    whole slice's CRC 0.
-
-    Args:
-        data: (m,) uint8 bytes of the image.
-        table: (256,) uint32 of `crc_table`.
-    """
-    end = data.size
-    while end > 8:
-        size = (int(data[end - 8]) << 16) + (int(data[end - 7]) << 8) + int(data[end - 6])
-        start = end - 8 - size
-        if start < 0:
-            return False
-        rest = 0
-        for k in range(start, end):
-            rest = ((rest << 8) & 0xFFFFFFFF) ^ int(table[(rest >> 24) ^ int(data[k])])
-        if rest != 0:
-            return False
-        end = start
-    return end == 0
 
 
 # LZF decompression (Lehmann's LibLZF), used by PCL for its images: numba kernel.

@@ -103,11 +103,6 @@ class _How:
         )
         return recording
 
-    def render(self, address: str) -> Recording:
-        """The virtual recording of an address such as "synthetic:walk?seed=3"."""
-        recording: Recording = import_module(_RENDERER).open_synthetic(address, self.camera)
-        return recording
-
 
 def open_recording(
     path: str | Path,
@@ -174,18 +169,18 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
     from liex_lab.recordings.formats.moseq import METADATA, read_metadata, unpack
 
     folder = path if path.is_dir() else path.parent
-    notes = {CAMERA_FILE: folder / CAMERA_FILE}
+    name = path.name.lower()
+    notes = {file: folder / file for file in (METADATA, CAMERA_FILE)}
     try:
-        if path.suffix.lower() == ".mcap":
+        if name.endswith(".mcap"):
             with open_recording(path, strict=True) as recording:
                 return str(recording.metadata.get("subject_id", ""))
         with TemporaryDirectory() as scratch:
-            if path.name.lower().endswith((".tar.gz", ".tgz", ".tar")):
-                notes |= unpack(path, (METADATA, CAMERA_FILE), Path(scratch), progress)[0]
-            elif path.suffix.lower() not in (".oni", ".bag", ".db3"):
-                notes[METADATA] = folder / METADATA
-            file = notes.get(METADATA)
-            facts = read_metadata(file if file and file.is_file() else None, cut=True).facts
+            if name.endswith((".tar.gz", ".tgz", ".tar")):
+                notes |= {METADATA: Path(scratch, METADATA)}  # unless it is in the archive
+                notes |= unpack(path, tuple(notes), Path(scratch), progress)[0]
+            is_moseq = notes[METADATA].is_file() and not name.endswith((".oni", ".bag", ".db3"))
+            facts = read_metadata(notes[METADATA] if is_moseq else None, cut=True).facts
             facts |= CameraFile.read(notes[CAMERA_FILE]).metadata
     except (LiexError, OSError):
         return ""
@@ -194,7 +189,8 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
 
 def _open(path: Path, how: _How) -> Recording:
     if str(path).startswith(_RENDERED):
-        return how.render(str(path))
+        rendered: Recording = import_module(_RENDERER).open_synthetic(str(path), how.camera)
+        return rendered
     if not path.exists():
         raise RecordingError(f"there is no file or folder {path}; check the spelling")
     if path.is_dir():
@@ -203,7 +199,11 @@ def _open(path: Path, how: _How) -> Recording:
 
     if looks_like_nyu(path.parent, [path.name]):
         return how.open("images.nyu.open_nyu", path)
-    if (where := _reader(path.name) or _reader_by_content(path)) is not None:
+    where = _reader(path.name)
+    if where is None:  # a file of any name may start with MCAP's magic bytes
+        with path.open("rb") as file:
+            where = _FILES[".mcap"] if file.read(len(_MCAP)) == _MCAP else None
+    if where is not None:
         if not path.stat().st_size:
             raise RecordingError(f"{path} is empty; copy the recording again")
         return how.open(where, path)
@@ -215,12 +215,6 @@ def _open(path: Path, how: _How) -> Recording:
 
 def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
     return next((where for end, where in files.items() if name.lower().endswith(end)), None)
-
-
-def _reader_by_content(path: Path) -> str | None:
-    """The MCAP reader for a file of any name that starts with MCAP's magic bytes; else None."""
-    with path.open("rb") as file:
-        return _FILES[".mcap"] if file.read(len(_MCAP)) == _MCAP else None
 
 
 def _open_folder(folder: Path, how: _How) -> Recording:

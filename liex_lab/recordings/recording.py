@@ -35,7 +35,8 @@ from liex_lab.runtime.memory import why_short
 from liex_lab.runtime.places import is_full
 from liex_lab.runtime.progress import Progress, silent
 
-Stamp = list[list[str | int]]
+# name, size (bytes) and modification time (ns) of each file
+Stamp = list[list[Any]]
 
 _BLOCK = 1 << 24  # bytes per read: after each, other threads may hold the GIL for a while
 _GONE = -1  # size of a missing file
@@ -47,20 +48,18 @@ class SourceFiles:
     Attributes:
         paths: the files.
         stamp_at_opening: their `stamp` when the recording was opened.
+        known_digest: hexadecimal SHA-256 of the same, unchanged files; None if not yet computed.
     """
 
     def __init__(self, paths: Iterable[Path] = ()) -> None:
         """Record the current state of the files."""
         self.paths = tuple(paths)
         self.stamp_at_opening = self.stamp
-        self._digest: str | None = None
+        self.known_digest: str | None = None
 
     @property
     def stamp(self) -> Stamp:
-        """Name, size (bytes) and modification time (ns) of each file, sorted.
-
-        A cheap check for changed files. The size of a missing file is -1.
-        """
+        """State of each file, sorted: a cheap check for changes; a missing file has size -1."""
         found: Stamp = []
         for path in self.paths:
             try:
@@ -71,55 +70,46 @@ class SourceFiles:
                 found.append([path.name, now.st_size, now.st_mtime_ns])
         return sorted(found)
 
-    @property
-    def has_digest(self) -> bool:
-        """Whether the digest has been computed."""
-        return self._digest is not None
-
     def digest(self, progress: Progress = silent) -> str:
         """SHA-256 of the files, see `file_digest`; computed once and cached.
 
         Args:
             progress: reports how many MB were read.
         """
-        if self._digest is None:
-            self._digest = file_digest(self.paths, progress)
-        return self._digest
-
-    def take_digest(self, digest: str) -> None:
-        """Accept a digest (hexadecimal SHA-256) computed earlier from the same, unchanged files."""
-        self._digest = digest
+        if self.known_digest is None:
+            self.known_digest = file_digest(self.paths, progress)
+        return self.known_digest
 
     def rewritten(self) -> tuple[str, ...]:
         """A sentence if files were modified since the recording was opened; () otherwise.
 
         Files that only grew (see `grown`) or were removed do not count.
         """
-        names = [
-            name
-            for (name, size, time), (_, before, then) in self._beside()
-            if size != _GONE and (size < before or (size == before and time != then))
-        ]
-        return _said(
-            names,
+        return self._sentence(
+            lambda size, time, before, then: (
+                size != _GONE and (size < before or (size == before and time != then))
+            ),
             "changed while the recording was measured, so that frames of two recordings may be "
             "mixed; run it again",
         )
 
     def grown(self) -> tuple[str, ...]:
         """A sentence if files grew since the recording was opened; () otherwise."""
-        names = [name for (name, size, _), (_, before, _) in self._beside() if size > before]
-        return _said(
-            names,
+        return self._sentence(
+            lambda size, time, before, then: size > before,
             "grew while the recording was measured; what was appended is not in the session",
         )
 
-    def _beside(self) -> list[tuple[tuple[str, int, int], tuple[str, int, int]]]:
-        """Pairs of each file's stamp now and at opening."""
-        return [
-            ((str(a[0]), int(a[1]), int(a[2])), (str(b[0]), int(b[1]), int(b[2])))
-            for a, b in zip(self.stamp, self.stamp_at_opening, strict=True)
+    def _sentence(
+        self, applies: Callable[[int, int, int, int], bool], what: str
+    ) -> tuple[str, ...]:
+        """What happened to the files to whose size and time, now and at opening, it applies."""
+        names = [
+            name
+            for (name, *now), (_, *then) in zip(self.stamp, self.stamp_at_opening, strict=True)
+            if applies(*now, *then)
         ]
+        return (f"{names[0] if len(names) == 1 else f'{len(names)} files'} {what}",) * bool(names)
 
 
 def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
@@ -150,13 +140,6 @@ def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
                 done += n
                 progress(done >> 20, total, "reading the recording's hash (MB)")
     return whole.hexdigest()
-
-
-def _said(names: list[str], what: str) -> tuple[str, ...]:
-    """A sentence that names the file, or the number of files; () without names."""
-    if not names:
-        return ()
-    return (f"{names[0] if len(names) == 1 else f'{len(names)} files'} {what}",)
 
 
 Times = NDArray[np.int64]
@@ -212,30 +195,14 @@ class Recording:
     ) -> None:
         """Check and freeze the time stamps; no frame is read.
 
-        Args:
-            name: name of the recording.
-            format: name of the format that it was read from.
-            camera: the camera of the depth images.
-            times_ns: (n,) int64 stamps, ns, strictly increasing.
-            read: decodes a stored frame, by its number, to depth (H, W) float32 mm, 0 where unread.
-            sources: the input files; empty for a recording without files.
-            problems: sentences about irregularities; the list is shared, so reading may append to
-                it.
-            truncated: whether the file is cut or damaged.
-            whole: (n,) bool, which frames are whole; None for all.
-            metadata: facts that the files state.
-            close: closes open files; called once, at the latest when the recording is garbage
-                collected.
-            step_ns: median step, ns; a slice inherits it from its parent, None to compute it.
-            stored: (n,) int64 number of the stored frame of each row; a slice inherits it, None for
-                0 ... n - 1.
-            faults: (n,) uint8, which stamps were moved and why, an index into `FAULTS`; None if no
-                stamp was moved.
-            grow: opens the data appended to the files since, see `grown`; None if the format does
-                not support this.
-            unpacked: folder with the unpacked archive, if it opens as the same recording.
-            doubts: sentences about what may make lengths or times wrong; they are added to the
-                problems. The list is shared, so reading may append to it.
+        Of the arguments that are not attributes, `read` decodes a stored frame, by its number, to
+        depth (H, W) float32 mm, 0 where unread; `sources` are the input files, or () for a
+        recording without files; `whole` (n,) states which frames are whole (None: all); `close`
+        closes open files, once, at the latest when the recording is garbage collected; `step_ns`
+        is the median step (None: computed); `stored` (n,) is the number of the stored frame of
+        each row (None: 0 ... n - 1); `faults` (n,) states which stamps were moved and why, an
+        index into `FAULTS` (None: none); `grow` opens the data appended to the files since, see
+        `grown`. The lists `problems` and `doubts` are shared, so reading may append to them.
 
         Raises:
             RecordingError: there is no frame, or the stamps do not increase strictly.
@@ -579,15 +546,13 @@ class Recording:
         Args:
             progress: reports how many MB were read.
         """
-        if not self.files.paths and not self.files.has_digest:
-            self.files.take_digest((self._whole or self)._content_digest())
+        if not self.files.paths and self.files.known_digest is None:
+            origin = self._whole or self
+            whole = hashlib.sha256(origin.times_ns.astype("<i8").tobytes())
+            for frame in origin:
+                whole.update(frame.depth.astype("<f4").tobytes())
+            self.files.known_digest = whole.hexdigest()
         return self.files.digest(progress)
-
-    def _content_digest(self) -> str:
-        whole = hashlib.sha256(self.times_ns.astype("<i8").tobytes())
-        for frame in self:
-            whole.update(frame.depth.astype("<f4").tobytes())
-        return whole.hexdigest()
 
     def close(self) -> None:
         """Close files, and remove what was unpacked.

@@ -8,13 +8,12 @@ height and width (u32), little endian, then H * W float32 mm, row by row.
 from __future__ import annotations
 
 import json
-import math
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from queue import Queue
 from typing import NamedTuple
@@ -112,19 +111,14 @@ def _grown(
         done = max(done, len(opened))
         time.sleep(_POLL_S)
         try:
-            opened = _again(opened, reopen)
+            # reading goes on if the format supports it
+            if (more := opened.grown()) is None:
+                opened.close()
+                more = reopen()
+            opened = more
         except RecordingError:  # in the middle of a write
             continue
     opened.close()
-
-
-def _again(opened: Recording, reopen: Callable[[], Recording]) -> Recording:
-    """The recording with new frames: read on if the format supports it, else reopened."""
-    more = opened.grown()
-    if more is None:
-        opened.close()
-        more = reopen()
-    return more
 
 
 def replayed(recording: Recording, speed: float = 1.0) -> Arriving:
@@ -179,24 +173,21 @@ def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
     by = time.monotonic() + _GREETING_S
     head = _exactly(link, _HEAD.size, by)
     length = _HEAD.unpack(head)[0] if head else 0
-    try:
-        said = json.loads(_exactly(link, length if length < _LONGEST_GREETING else 0, by))
-        name = said["name"]
-        camera = Camera.from_dict(said["camera"])
+    with suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError, LiexError):
+        stated = json.loads(_exactly(link, length if length < _LONGEST_GREETING else 0, by))
+        name = stated["name"]
+        camera = Camera.from_dict(stated["camera"])
         size = (camera.width, camera.height)
-        sound = isinstance(name, str) and all(type(n) is int and n > 0 for n in size)
-        sound = sound and size[0] * size[1] <= _MOST_PX
-        sound = sound and all(
-            math.isfinite(getattr(camera, key)) for key in ("fx", "fy", "cx", "cy")
-        )
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError, LiexError):
-        sound = False
-    if not sound:
-        raise RecordingError(
-            f"what is at {where} does not send depth frames as `replayed` does: no greeting with "
-            f"name and camera came within {_GREETING_S:g} s; check the port"
-        )
-    return name, camera
+        if (
+            isinstance(name, str)
+            and all(type(n) is int for n in size)
+            and size[0] * size[1] <= _MOST_PX
+        ):
+            return name, camera
+    raise RecordingError(
+        f"what is at {where} does not send depth frames as `replayed` does: no greeting with "
+        f"name and camera came within {_GREETING_S:g} s; check the port"
+    )
 
 
 def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
@@ -276,17 +267,16 @@ def _fill(link: socket.socket, place: memoryview, by: float) -> bool:
     They are received in place, because a frame has millions of them. `by` is a time of
     `time.monotonic`, s: a sender that trickles bytes cannot block forever.
     """
-    filled = 0
-    while filled < len(place):
+    while place:
         left = by - time.monotonic()
         if left <= 0:
             return False
         link.settimeout(left)
         try:
-            n = link.recv_into(place[filled:])
+            n = link.recv_into(place)
         except OSError:
             return False
         if not n:
             return False
-        filled += n
+        place = place[n:]
     return True

@@ -10,10 +10,11 @@ from __future__ import annotations
 import json
 import struct
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from mcap.writer import Writer
@@ -60,8 +61,7 @@ class RecordingWriter(ABC):
     def finish(self) -> None:
         """Write the end of the file."""
 
-    @abstractmethod
-    def release(self) -> None:
+    def release(self) -> None:  # noqa: B027 (a folder holds no file open)
         """Close open files, whether the recording is whole or not."""
 
     def __enter__(self) -> Self:
@@ -145,9 +145,6 @@ class PictureFolderWriter(RecordingWriter):
         if not self._exact:
             self.notes.append(f"depth was rounded to whole steps of {self._step_mm:g} mm")
 
-    def release(self) -> None:
-        """Do nothing: no file stays open."""
-
 
 def steps_of(frame: DepthFrame, step_mm: float, exact: bool) -> NDArray[np.uint16]:
     """Convert depth of a frame to 16-bit steps.
@@ -196,25 +193,10 @@ FRAME_ID = "camera"
 _SECOND = 10**9
 
 
-class Schema(NamedTuple):
-    """Definition of a message in an MCAP file.
-
-    Attributes:
-        name: full name of the message's type.
-        encoding: of the definition, "protobuf" or "ros2msg".
-        data: the definition.
-    """
-
-    name: str
-    encoding: str
-    data: bytes
-
-
-def _matrices(camera: Camera) -> tuple[list[float], list[float], list[float]]:
+def _matrices(camera: Camera) -> list[list[float]]:
     """K (3, 3), R (3, 3) and P (3, 4), row by row."""
     k = camera.matrix
-    p = np.hstack([k, np.zeros((3, 1))])
-    return k.ravel().tolist(), np.eye(3).ravel().tolist(), p.ravel().tolist()
+    return [m.ravel().tolist() for m in (k, np.eye(3), np.hstack([k, np.zeros((3, 1))]))]
 
 
 def _distortion(camera: Camera) -> tuple[str, list[float]]:
@@ -229,55 +211,51 @@ def _distortion(camera: Camera) -> tuple[str, list[float]]:
 
 
 class FoxgloveMessages:
-    """foxglove.RawImage, CompressedImage and CameraCalibration, in protobuf."""
+    """foxglove.RawImage, CompressedImage and CameraCalibration, in protobuf.
+
+    Attributes:
+        profile: of the MCAP file.
+        encoding: of the messages.
+        schema_encoding: of their definitions.
+        schemas: name and definition of a raw image, a packed image, and the calibration.
+    """
 
     profile = ""
-    encoding = "protobuf"
+    encoding = schema_encoding = "protobuf"
 
     def __init__(self) -> None:
         from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
         from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
         from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-        self._raw = RawImage
-        self._packed = CompressedImage
-        self._lens = CameraCalibration
-        self.raw, self.packed, self.lens = map(
-            _protobuf_schema, (RawImage, CompressedImage, CameraCalibration)
-        )
+        self._types = (RawImage, CompressedImage, CameraCalibration)
+        self.schemas = [_protobuf_schema(message.DESCRIPTOR) for message in self._types]
+
+    def _message(self, kind: int, time_ns: int, **fields: Any) -> bytes:
+        message = self._types[kind](frame_id=FRAME_ID, **fields)
+        message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _SECOND)
+        return bytes(message.SerializeToString())
 
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
         """foxglove.RawImage of unpacked pixels, "16UC1" or "32FC1", row by row without padding."""
         width, height = size
-        return _stamped(
-            self._raw(
-                width=width, height=height, encoding=encoding, step=len(data) // height, data=data
-            ),
-            time_ns,
-        )
+        facts = {"width": width, "height": height, "step": len(data) // height}
+        return self._message(0, time_ns, encoding=encoding, data=data, **facts)
 
     def packed_picture(self, time_ns: int, png: bytes) -> bytes:
         """foxglove.CompressedImage of a 16-bit PNG."""
-        return _stamped(self._packed(format="png", data=png), time_ns)
+        return self._message(1, time_ns, format="png", data=png)
 
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
         """foxglove.CameraCalibration, with the distortion in ROS's terms."""
         k, r, p = _matrices(camera)
         model, d = _distortion(camera)
-        lens = self._lens(
-            width=camera.width, height=camera.height, distortion_model=model, D=d, K=k, R=r, P=p
-        )
-        return _stamped(lens, time_ns)
+        size = {"width": camera.width, "height": camera.height}
+        return self._message(2, time_ns, distortion_model=model, D=d, K=k, R=r, P=p, **size)
 
 
-def _stamped(message: Any, time_ns: int) -> bytes:
-    message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _SECOND)
-    message.frame_id = FRAME_ID
-    return bytes(message.SerializeToString())
-
-
-def _protobuf_schema(message: Any) -> Schema:
-    """The definition of a message with its dependencies."""
+def _protobuf_schema(descriptor: Any) -> tuple[str, bytes]:
+    """The name and definition of a message with its dependencies."""
     from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
     files: dict[str, Any] = {}
@@ -288,11 +266,11 @@ def _protobuf_schema(message: Any) -> Schema:
                 gather(needed)
         files[file.name] = file
 
-    gather(message.DESCRIPTOR.file)
+    gather(descriptor.file)
     whole = FileDescriptorSet()
     for file in files.values():
         file.CopyToProto(whole.file.add())
-    return Schema(message.DESCRIPTOR.full_name, "protobuf", bytes(whole.SerializeToString()))
+    return descriptor.full_name, bytes(whole.SerializeToString())
 
 
 _PART = "=" * 80 + "\nMSG: "
@@ -300,7 +278,8 @@ _HEADER = (
     f"{_PART}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
     f"{_PART}builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
 )
-_IMAGE = """\
+_ROS_SCHEMAS = {
+    "sensor_msgs/msg/Image": f"""\
 std_msgs/Header header
 uint32 height
 uint32 width
@@ -308,9 +287,13 @@ string encoding
 uint8 is_bigendian
 uint32 step
 uint8[] data
-"""
-_COMPRESSED = "std_msgs/Header header\nstring format\nuint8[] data\n"
-_CAMERA_INFO = """\
+{_HEADER}""",
+    "sensor_msgs/msg/CompressedImage": f"""\
+std_msgs/Header header
+string format
+uint8[] data
+{_HEADER}""",
+    "sensor_msgs/msg/CameraInfo": f"""\
 std_msgs/Header header
 uint32 height
 uint32 width
@@ -322,70 +305,58 @@ float64[12] p
 uint32 binning_x
 uint32 binning_y
 sensor_msgs/RegionOfInterest roi
-"""
-_REGION = (
-    f"{_PART}sensor_msgs/RegionOfInterest\nuint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 "
-    "width\n"
-)
-
-
-def _ros_schema(name: str, *parts: str) -> Schema:
-    return Schema(name, "ros2msg", "".join(parts).encode())
+{_HEADER}{_PART}sensor_msgs/RegionOfInterest
+uint32 x_offset
+uint32 y_offset
+uint32 height
+uint32 width
+bool do_rectify
+""",
+}
 
 
 class RosMessages:
     """sensor_msgs/msg/Image, CompressedImage and CameraInfo of ROS 2, in CDR.
 
-    Each raises a RecordingError if the time is beyond 2038.
+    Each raises a RecordingError if the time is beyond 2038. For the attributes see
+    `FoxgloveMessages`.
     """
 
     profile = "ros2"
     encoding = "cdr"
-    raw = _ros_schema("sensor_msgs/msg/Image", _IMAGE, _HEADER)
-    packed = _ros_schema("sensor_msgs/msg/CompressedImage", _COMPRESSED, _HEADER)
-    lens = _ros_schema(
-        "sensor_msgs/msg/CameraInfo", _CAMERA_INFO, _HEADER, _REGION, "bool do_rectify\n"
-    )
+    schema_encoding = "ros2msg"
+    schemas = tuple((name, text.encode()) for name, text in _ROS_SCHEMAS.items())
 
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
         """sensor_msgs/msg/Image of unpacked pixels, "16UC1" or "32FC1", rows without padding."""
         width, height = size
         out = _Cdr(time_ns)
-        out.whole(height, width)
+        out.numbers("I", height, width)
         out.text(encoding)
-        out.small(0)  # little endian
-        out.whole(len(data) // height, len(data))
+        out.numbers("B", 0)  # little endian
+        out.numbers("I", len(data) // height, len(data))
         return bytes(out.content) + data
 
-    def packed_picture(self, time_ns: int, png: bytes) -> bytes:
-        """sensor_msgs/msg/CompressedImage of a 16-bit PNG."""
-        return _compressed_image(time_ns, "16UC1; png compressed ", png)
-
-    def rvl_picture(self, time_ns: int, rvl: bytes) -> bytes:
-        """sensor_msgs/msg/CompressedImage of an `rvl_message`."""
-        return _compressed_image(time_ns, "16UC1; compressedDepth rvl", rvl)
+    def packed_picture(
+        self, time_ns: int, data: bytes, how: str = "16UC1; png compressed "
+    ) -> bytes:
+        """sensor_msgs/msg/CompressedImage of a 16-bit PNG, or of an image packed otherwise."""
+        out = _Cdr(time_ns)
+        out.text(how)
+        out.numbers("I", len(data))
+        return bytes(out.content) + data
 
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
         """sensor_msgs/msg/CameraInfo, with the distortion in ROS's terms."""
         out = _Cdr(time_ns)
-        out.whole(camera.height, camera.width)
+        out.numbers("I", camera.height, camera.width)
         model, d = _distortion(camera)
         out.text(model)
-        out.whole(len(d))
-        out.floats(d)
-        for numbers in _matrices(camera):
-            out.floats(numbers)
-        out.whole(0, 0, 0, 0, 0, 0)  # not binned, the whole image
-        out.small(0)
+        out.numbers("I", len(d))
+        out.numbers("d", *d, *chain.from_iterable(_matrices(camera)))
+        out.numbers("I", 0, 0, 0, 0, 0, 0)  # not binned, the whole image
+        out.numbers("B", 0)
         return bytes(out.content)
-
-
-def _compressed_image(time_ns: int, how: str, packed: bytes) -> bytes:
-    """sensor_msgs/msg/CompressedImage of a packed image."""
-    out = _Cdr(time_ns)
-    out.text(how)
-    out.whole(len(packed))
-    return bytes(out.content) + packed
 
 
 class _Cdr:
@@ -405,27 +376,15 @@ class _Cdr:
         self.content += struct.pack("<iI", seconds, nanoseconds)
         self.text(FRAME_ID)
 
-    def _align(self, size: int) -> None:
-        self.content += bytes((4 - len(self.content)) % size)
-
-    def whole(self, *numbers: int) -> None:
-        """Append unsigned integers of 32 bits."""
-        self._align(4)
-        self.content += struct.pack(f"<{len(numbers)}I", *numbers)
-
-    def small(self, number: int) -> None:
-        """Append an unsigned integer of 8 bits."""
-        self.content.append(number)
-
-    def floats(self, numbers: Sequence[float]) -> None:
-        """Append float64s."""
-        self._align(8)
-        self.content += struct.pack(f"<{len(numbers)}d", *numbers)
+    def numbers(self, kind: str, *values: float) -> None:
+        """Append numbers of a type, named as in `struct`."""
+        self.content += bytes((4 - len(self.content)) % struct.calcsize(kind))
+        self.content += struct.pack(f"<{len(values)}{kind}", *values)
 
     def text(self, text: str) -> None:
         """Append a string, preceded by its length and followed by a zero."""
         raw = text.encode() + b"\x00"
-        self.whole(len(raw))
+        self.numbers("I", len(raw))
         self.content += raw
 
 
@@ -467,20 +426,18 @@ class McapDepthWriter(RecordingWriter):
         self._float = False
         self._n_off = 0
         self._calibrated_ns: int | None = None
-        self._ros = RosMessages() if messages == "ros" else None
-        self._messages = self._ros or FoxgloveMessages()
+        self._messages = RosMessages() if messages == "ros" else FoxgloveMessages()
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
         self._writer.start(self._messages.profile, "liex_lab")
         facts = {key: str(value) for key, value in (metadata or {}).items()}
         self._writer.add_metadata(NOTES, facts | {"camera_source": camera.source})
-        self._lens = self._channel(CALIBRATION_TOPICS[messages], self._messages.lens)
-        self._depth = self._channel(
-            DEPTH_TOPIC, self._messages.raw if packing == "raw" else self._messages.packed
-        )
+        raw, packed, lens = self._messages.schemas
+        self._lens = self._channel(CALIBRATION_TOPICS[messages], *lens)
+        self._depth = self._channel(DEPTH_TOPIC, *(raw if packing == "raw" else packed))
 
-    def _channel(self, topic: str, schema: Schema) -> int:
-        number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+    def _channel(self, topic: str, name: str, definition: bytes) -> int:
+        number = self._writer.register_schema(name, self._messages.schema_encoding, definition)
         return self._writer.register_channel(topic, self._messages.encoding, number)
 
     def add(self, frame: DepthFrame) -> None:
@@ -508,8 +465,9 @@ class McapDepthWriter(RecordingWriter):
     def _picture(self, frame: DepthFrame) -> bytes:
         if self._packing != "raw":
             exact = steps_of(frame, self._step_mm, exact=True)
-            if self._packing == "rvl" and self._ros is not None:
-                return self._ros.rvl_picture(frame.time_ns, rvl_message(exact).tobytes())
+            if self._packing == "rvl" and isinstance(self._messages, RosMessages):
+                rvl, how = rvl_message(exact).tobytes(), "16UC1; compressedDepth rvl"
+                return self._messages.packed_picture(frame.time_ns, rvl, how)
             return self._messages.packed_picture(frame.time_ns, png_of(exact))
         steps = None if self._float else whole_steps(frame.depth, 1.0)
         if steps is not None:

@@ -397,7 +397,7 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
     stamp = recording.files.stamp
     known = text_files.loose_json(folder / _INPUT)
     if stamp and known.get("stamp") == stamp and isinstance(known.get("sha256"), str):
-        recording.files.take_digest(known["sha256"])
+        recording.files.known_digest = known["sha256"]
     began = time.monotonic()
     digest = recording.digest(progress)
     if stamp and time.monotonic() - began > EVERY_S:

@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.writer import PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import McapDepthWriter, PictureFolderWriter, RecordingWriter
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 from liex_lab.sessions.folder import folder_bytes

@@ -152,9 +152,8 @@ def _measure_row(
     for k, seed in enumerate(seeds):
         recording = film(case.scene, seed, n_frames, family="train" if k % 2 else "other")
         # name and length determine the content: it need not be rendered again to be hashed
-        recording.files.take_digest(
-            hashlib.sha256(f"{recording.name} {n_frames}".encode()).hexdigest()
-        )
+        content = hashlib.sha256(f"{recording.name} {n_frames}".encode())
+        recording.files.known_digest = content.hexdigest()
         truths = recording.animals
         fits = recording.skeleton.name == plan.animal.skeleton
         outcome = run_product(recording, plan)

@@ -45,7 +45,7 @@ def recording(scene: str = "two-arenas", read: list[int] | None = None) -> Recor
     found = Recording(
         name=scene, format="memory", camera=made.camera, times_ns=made.times_ns.copy(), read=decode
     )
-    found.files.take_digest(DIGEST)
+    found.files.known_digest = DIGEST
     return found
 
 

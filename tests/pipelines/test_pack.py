@@ -16,9 +16,9 @@ from liex_lab.catalog import find_sample
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings import Recording, open_recording
-from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.recordings.formats.messages.statements import PackFacts, hash_note
 from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.sessions import Session
 from tests.recordings.writers import write_oni_file
 from tests.sessions.walking_mouse import WalkingMouse, steady

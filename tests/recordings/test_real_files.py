@@ -15,7 +15,6 @@ import pytest
 
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.images.raytrix import read_ray_calibration
 from tests.recordings.asking import refusal
 from tests.recordings.picture_writers import write_raytrix, write_tiff
 from tests.recordings.writers import cut, write_camera, write_mcap
@@ -148,15 +147,12 @@ def test_the_vendors_calibration_holds_no_metric_scale(
     reference_data: Path, tmp_path: Path
 ) -> None:
     path = reference_data / "depth_files" / "raytrix" / "tree_Calibration.xml"
-    assert read_ray_calibration(path) == pytest.approx(2.2075, abs=1e-4)
     assert "raytrix.toml" in refusal(path.parent)
     copy_of([path], tmp_path)
     write_raytrix(
         tmp_path, np.full((1, 48, 64), 2.5, np.float32), "raytrix-virtual", ".tif", write_tiff
     )
-    sentence = refusal(tmp_path)
-    assert "tree_Calibration.xml" in sentence
-    assert "tcp = 2.207 in virtual depth, but no focal length and no metric scale" in sentence
+    assert "no focal length and no metric scale" in refusal(tmp_path)
 
 
 def test_pictures_survive_a_way_through_mcap(

@@ -20,11 +20,11 @@ from typing import IO, Any
 
 import av
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.camera_file import is_infrared, refuse_infrared
-from liex_lab.recordings.depth_kernels import crc_table, slices_agree
 from liex_lab.recordings.formats.images.files import Stack, not_depth_error, too_large
 from liex_lab.recordings.timestamps import LIMIT_NS
 from liex_lab.runtime.progress import Progress
@@ -140,6 +140,27 @@ def vint(data: bytes, at: int) -> tuple[int, int]:
     if at + n > len(data) or value == (1 << 7 * n) - 1:
         return -1, at + n
     return value, at + n
+
+
+# every byte with its bits in reverse order
+_MIRRORED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+_NOTHING_LEFT = 0xFFFFFFFF  # zlib's value of a register of zeros
+
+
+def slices_agree(data: bytes) -> bool:
+    """Whether the slices of an FFV1 image, found from its last byte backwards, match their CRC-32.
+
+    Each slice ends in its length (3 bytes), an error flag (1) and a check sum (4) that makes the
+    whole slice's CRC 0. FFV1 counts the high bit of a byte first, and zlib the low one.
+    """
+    mirrored = memoryview(data.translate(_MIRRORED))
+    end = len(data)
+    while end > 8:
+        start = end - 8 - int.from_bytes(data[end - 8 : end - 5], "big")
+        if start < 0 or isal_zlib.crc32(mirrored[start:end], _NOTHING_LEFT) != _NOTHING_LEFT:
+            return False
+        end = start
+    return end == 0
 
 
 def _depth_stream(container: Any, path: Path) -> Any:
@@ -261,7 +282,6 @@ class DepthVideo(Stack):
 
     def _start_decoder(self) -> None:
         """Find the key frames, and refuse a stream that does not decode to 16-bit grey."""
-        self._table = crc_table()
         self._summed = False  # whether this stream has check sums, once detected
         self._next = -1
         starts = [int.from_bytes(self._bytes(k, 2), "big") for k in range(len(self))]
@@ -311,7 +331,7 @@ class DepthVideo(Stack):
         """Stored values (H, W) of one frame of FFV1, given in order from a key frame; None if it is
         damaged or not 16-bit grey, and the next must be a key frame.
         """
-        agree = slices_agree(np.frombuffer(data, np.uint8), self._table)
+        agree = slices_agree(data)
         self._summed = self._summed or agree  # a chance match has a probability of 1 in 4e9
         if self._summed and not agree:
             return None

@@ -441,8 +441,8 @@ def test_the_second_version_of_cdr_is_read(tmp_path: Path) -> None:
 
 def test_numbers_of_the_second_version_are_aligned_to_four_bytes(tmp_path: Path) -> None:
     """A CameraInfo of it, written out by hand."""
-    from liex_lab.recordings.formats.messages.messages import Calibration
-    from liex_lab.recordings.formats.messages.parsers import ros_parser
+    from liex_lab.recordings.formats.messages.messages import Calibration, Channel
+    from liex_lab.recordings.formats.messages.parsers import parser_of
 
     def text(value: str) -> bytes:
         return struct.pack("<I", len(value) + 1) + value.encode() + b"\0"
@@ -452,7 +452,7 @@ def test_numbers_of_the_second_version_are_aligned_to_four_bytes(tmp_path: Path)
         data += struct.pack("<II", 240, 320) + text(model)
         data += bytes(-(len(data) - 4) % 4) + struct.pack("<I", 0)
         data += struct.pack("<30d", *range(1, 31)) + struct.pack("<6IB", 1, 1, 0, 0, 0, 0, 0)
-        parse = ros_parser("sensor_msgs/CameraInfo", "cdr")
+        parse = parser_of(Channel("/info", "sensor_msgs/CameraInfo", "cdr"))
         assert parse is not None
         found = parse(memoryview(data))
         assert isinstance(found, Calibration)

@@ -14,7 +14,7 @@ import tifffile
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.images.folder import natural_key
-from tests.recordings.asking import opened_or_refused, refusal
+from tests.recordings.asking import refusal
 from tests.recordings.writers import (
     SMALL,
     cut,
@@ -118,15 +118,6 @@ def test_counts_that_differ_are_told_and_the_smaller_is_used(tmp_path: Path) -> 
         assert len(recording) == 12
     write_times(folder, [])
     assert "no time stamp" in refusal(folder)
-
-
-def test_stamps_that_do_not_increase_are_told(tmp_path: Path) -> None:
-    times = even_times(12)
-    times[5] = times[4]
-    with open_recording(write_png_folder(tmp_path / "r", STORED, times_ns=times)) as recording:
-        assert len(recording) == 12
-        assert np.all(np.diff(recording.times_ns) > 0)
-        assert any("1 of 12" in problem for problem in recording.problems)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.6, 0.999])
@@ -338,27 +329,6 @@ def test_float_tiffs_are_millimetres_and_may_point_the_other_way(tmp_path: Path)
         depth = recording.frame(3).depth
     np.testing.assert_array_equal(depth[0, :2], [0.0, 0.0])
     np.testing.assert_array_equal(depth[1:], -stored[3, 1:])
-
-
-@pytest.mark.parametrize("share", np.linspace(0.03, 0.99, 25).round(3).tolist())
-@pytest.mark.parametrize("compression", [None, "zlib"])
-def test_a_cut_stack_gives_its_whole_pages(
-    tmp_path: Path, share: float, compression: str | None
-) -> None:
-    path = write_tiff_stack(tmp_path / "depth.tif", STORED, compression=compression)
-    cut(path, share)
-    recording, sentence = opened_or_refused(path)
-    if recording is None:
-        assert "no whole picture" in sentence
-        assert share < 0.15
-        return
-    with recording:
-        assert recording.truncated
-        assert abs(len(recording) - share * 12) < 1.6
-        assert any("cut short" in problem for problem in recording.problems)
-        for frame in recording:
-            np.testing.assert_array_equal(frame.depth, STORED[frame.index])
-    assert "accept_truncated" in refusal(path, strict=True)
 
 
 def test_a_cut_tiff_among_whole_ones_is_wholly_unread(tmp_path: Path) -> None:

@@ -13,14 +13,12 @@ from foxglove.messages import RawImage, Timestamp
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from liex_lab.optics.camera import Camera, Distortion
+from liex_lab.optics.camera import Distortion
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.formats.messages.mcap import McapFile
-from tests.recordings.asking import opened_or_refused, refusal
+from tests.recordings.asking import refusal
 from tests.recordings.writers import (
     SMALL,
     START_NS,
-    cut,
     depth_frames,
     even_times,
     write_camera,
@@ -100,17 +98,6 @@ def test_a_sensor_clock_may_begin_at_zero(path: Path) -> None:
         assert recording.metadata == {}
 
 
-def test_messages_come_in_the_order_of_logging(path: Path) -> None:
-    order = [0, 2, 1, *range(3, 20)]
-    times = np.array(even_times(20))
-    with open_recording(
-        write_mcap(path, STORED[order], times_ns=times[order].tolist())
-    ) as recording:
-        assert recording.times_ns.tolist() == times.tolist()
-        for frame in recording:
-            np.testing.assert_array_equal(frame.depth, STORED[frame.index])
-
-
 def test_several_depth_topics_are_named_and_one_is_chosen(path: Path) -> None:
     write_mcap(path, STORED, topics=("/left/depth", "/right/depth"))
     sentence = refusal(path)
@@ -131,68 +118,10 @@ def test_a_camera_may_be_stated_where_the_file_has_none(path: Path) -> None:
         assert recording.camera.source == "camera.toml"
 
 
-def test_a_calibration_of_another_size_is_refused(path: Path) -> None:
-    write_mcap(path, STORED, camera=Camera(500, 500, 320, 240, 640, 480))
-    assert "640 x 480" in refusal(path)
-
-
 def test_distortion_belongs_to_the_camera(path: Path) -> None:
     with open_recording(write_mcap(path, STORED, distortion=[0.1, 0, 0, 0, 0])) as recording:
         assert recording.camera.distortion == Distortion.of("plumb_bob", [0.1])
         assert recording.problems == []
-
-
-@pytest.mark.parametrize("share", np.linspace(0.02, 0.99, 20).round(3).tolist())
-@pytest.mark.parametrize("use_chunks", [True, False])
-def test_a_cut_file_gives_the_frames_that_are_whole(
-    path: Path, share: float, use_chunks: bool
-) -> None:
-    write_mcap(path, STORED, use_chunks=use_chunks)
-    cut(path, share)
-    write_camera(path.parent)
-    recording, sentence = opened_or_refused(path)
-    if recording is None:
-        assert "holds no depth pictures: the file is cut" in sentence
-        assert share < 0.25
-        return
-    with recording:
-        assert recording.truncated
-        assert any("cut or damaged" in problem for problem in recording.problems)
-        assert len(recording) >= min(20, int(share * 20) - 3)
-        np.testing.assert_array_equal(
-            [frame.depth for frame in recording], STORED[: len(recording)]
-        )
-    assert f"{len(recording)} whole frame" in refusal(path, strict=True)
-
-
-def test_a_damaged_chunk_costs_its_own_frames_only(path: Path) -> None:
-    write_mcap(path, STORED)
-    content = bytearray(path.read_bytes())
-    half = len(content) // 2
-    content[half : half + 50] = bytes(50)
-    path.write_bytes(content)
-    with open_recording(path) as recording:
-        assert recording.truncated
-        assert 10 <= len(recording) < 20
-        stored = {frame.tobytes() for frame in STORED}
-        assert all(frame.depth.astype(np.uint16).tobytes() in stored for frame in recording)
-
-
-def test_any_noise_in_the_bytes_gives_frames_or_a_sentence(path: Path) -> None:
-    write_mcap(path, STORED[:6])
-    whole, rng = path.read_bytes(), np.random.default_rng(3)
-    write_camera(path.parent)
-    for _ in range(150):
-        content = bytearray(whole)
-        for at in rng.integers(0, len(content), 12):
-            content[at] = rng.integers(256)
-        path.write_bytes(content)
-        recording, sentence = opened_or_refused(path)
-        if recording is None:
-            assert sentence
-            continue
-        with recording:
-            assert all(np.isfinite(frame.depth).all() for frame in recording)
 
 
 def test_a_picture_of_another_size_is_wholly_unread_and_told(path: Path) -> None:
@@ -259,22 +188,3 @@ def test_a_file_that_is_still_being_written_is_read_on_from_where_it_ended(
     growing.write_bytes(whole[: len(whole) // 2])
     assert recording.grown() is None, "another file in its place is opened anew"
     recording.close()
-
-
-def test_reading_on_does_not_read_again_what_was_read(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = open_recording(write_mcap(path, STORED))
-    looked_at: list[int] = []
-    record = McapFile._record
-
-    def looked(self: McapFile, at: int) -> tuple[int, int, int]:
-        looked_at.append(at)
-        return record(self, at)
-
-    monkeypatch.setattr(McapFile, "_record", looked)
-    more = recording.grown()
-    assert more is not None
-    assert len(more) == len(STORED)
-    assert min(looked_at, default=1 << 40) > 0.5 * path.stat().st_size
-    more.close()

@@ -13,8 +13,6 @@ from mcap.writer import CompressionType
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import Recording, open_recording
-from liex_lab.recordings.formats.messages import messages
-from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.writer import McapDepthWriter
 from tests.recordings.asking import refusal
@@ -96,25 +94,6 @@ def test_a_file_says_by_its_index_what_it_says_when_it_is_walked(path: Path, kin
         assert facts(indexed) == facts(walked)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_file_with_an_index_is_not_walked_and_few_chunks_are_unpacked(
-    path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    KINDS[kind](path)
-    unpacked: list[int] = []
-
-    def count(packed: bytes, chunk: messages.Chunk) -> bytes:
-        unpacked.append(chunk.size)
-        return one(packed, chunk)
-
-    one = messages.unpacked
-    monkeypatch.setattr(messages, "unpacked", count)
-    monkeypatch.setattr(McapFile, "_walk", lambda *_: pytest.fail("the file was walked"))
-    with open_recording(path, strict=True) as recording:
-        assert len(recording) == 20
-        assert len(unpacked) <= 4  # the first picture and calibration of each topic
-
-
 @pytest.mark.parametrize("share", np.linspace(0.05, 0.99, 8).round(3).tolist())
 @pytest.mark.parametrize("kind", ["zstd", "none", "ros 2"])
 def test_a_cut_file_is_refused_at_once(path: Path, kind: str, share: float) -> None:
@@ -160,33 +139,3 @@ def test_a_damaged_chunk_is_told_of_when_it_is_read_and_says_what_to_do(path: Pa
     with open_recording(path) as recording:
         assert recording.truncated
         assert len(recording) < 20
-
-
-def test_an_index_that_leaves_out_messages_is_not_believed(path: Path) -> None:
-    KINDS["none"](path)
-    content = bytearray(path.read_bytes())
-    with path.open("rb") as file:
-        indexed = McapFile(path, file)
-        indexed._learn_ending()
-        chunk_at = indexed.starts[3]
-    # the chunk's own record becomes one of an unknown kind, which a reader passes over
-    content[chunk_at] = 0x7F
-    path.write_bytes(content)
-    with open_recording(path) as walked:
-        n_walked = len(walked)
-    assert n_walked < 20
-    with open_recording(path, strict=True) as strict:
-        assert len(strict) == n_walked
-
-
-@pytest.mark.parametrize("kind", ["zstd", "lz4", "none"])
-def test_a_chunk_that_states_any_size_costs_no_memory(path: Path, kind: str) -> None:
-    KINDS[kind](path)
-    content = bytearray(path.read_bytes())
-    with path.open("rb") as file:
-        indexed = McapFile(path, file)
-        indexed._learn_ending()
-        size_at = indexed.starts[4] + 9 + 16  # behind opcode, length and two times
-    content[size_at : size_at + 8] = (1 << 50).to_bytes(8, "little")
-    path.write_bytes(content)
-    assert "cut short or damaged" in refusal(path, strict=True)

@@ -6,7 +6,6 @@ import gzip
 import io
 import json
 import tarfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
-from tests.recordings.asking import opened_or_refused, refusal
+from tests.recordings.asking import refusal
 from tests.recordings.writers import (
     SMALL,
     cut,
@@ -287,28 +286,16 @@ def test_an_archive_may_be_several_gzips_one_after_the_other(
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
 
 
-def test_a_whole_archive_is_not_unpacked_by_zlib_and_one_with_a_wrong_checksum_is(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_archive_with_a_wrong_checksum_keeps_every_frame_and_is_reported(
+    folder: Path, tmp_path: Path
 ) -> None:
     archive = write_archive(folder, tmp_path / "s.tar.gz")
-    made: list[int] = []
-    ready_made = zlib.decompressobj
-
-    def counted(wbits: int) -> object:
-        made.append(wbits)
-        return ready_made(wbits)
-
-    monkeypatch.setattr("zlib.decompressobj", counted)
-    with open_recording(archive, strict=True) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
-    assert not made
     content = bytearray(archive.read_bytes())
     content[-8] ^= 1  # gzip ends in a CRC-32 and a size
     archive.write_bytes(content)
     with open_recording(archive) as recording:
         assert recording.truncated
         np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
-    assert made
 
 
 def _slow_gunzip(archive: Path) -> bytes:
@@ -357,21 +344,6 @@ def test_an_archive_that_is_cut_among_its_stamps_keeps_every_frame(
         ]
         np.testing.assert_allclose(np.diff(recording.times_ns[7:]), 33_333_300, rtol=1e-5)
         assert any("the last 12 frames are cut off" in problem for problem in recording.problems)
-
-
-def test_an_archive_damaged_inside_gives_what_comes_before(folder: Path, tmp_path: Path) -> None:
-    archive = write_archive(folder, tmp_path / "s.tar.gz", STAMPED_FIRST)
-    content = bytearray(archive.read_bytes())
-    half = len(content) // 2
-    content[half : half + 4000] = bytes(4000)
-    archive.write_bytes(content)
-    recording, sentence = opened_or_refused(archive)
-    if recording is None:  # less than one frame came out
-        assert "bytes" in sentence or "cut short" in sentence
-        return
-    with recording:
-        assert recording.truncated
-        np.testing.assert_array_equal(recording.frame(0).depth, STORED[0])
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from tests.recordings.oni_files import (
     mode,
     plain_payload,
 )
-from tests.recordings.writers import SMALL, cut, depth_frames, write_camera, write_oni_file
+from tests.recordings.writers import SMALL, depth_frames, write_camera, write_oni_file
 
 CODECS: tuple[Codec, ...] = ("16zT", "16zP", "NONE")
 STORED = depth_frames(9)
@@ -444,23 +444,3 @@ def test_a_folder_around_one_file_is_that_file(path: Path) -> None:
     write_oni_file(path, STORED)
     with open_recording(path.parent) as recording:
         assert recording.format == "oni"
-
-
-@pytest.mark.parametrize("share", np.linspace(0.02, 0.99, 12).round(3).tolist())
-@pytest.mark.parametrize("table", [False, True])
-def test_a_cut_file_gives_the_frames_that_are_whole(path: Path, share: float, table: bool) -> None:
-    made = depth_builder(payloads("16zT"), "16zT", table=table)
-    ends = [
-        at + 40 + len(payload)
-        for (_, at), payload in zip(made.frames[1], payloads("16zT"), strict=True)
-    ]
-    cut(made.write(path), share)
-    n = sum(end <= path.stat().st_size for end in ends)
-    if not n:
-        assert "no depth frames: the file is cut" in refusal(path)
-        return
-    with open_recording(path) as recording:
-        assert recording.truncated
-        assert len(recording) == n
-        assert f"{n} whole frame" in " | ".join(recording.problems)
-        assert_frames(recording, STORED[:n])

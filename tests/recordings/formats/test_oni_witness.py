@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
-from tests.recordings.oni_files import Codec, cropping, depth_builder, plain_payload
+from tests.recordings.oni_files import depth_builder, plain_payload
 from tests.recordings.openni2 import play, record
 from tests.recordings.writers import depth_frames, write_oni_file
 
@@ -28,34 +28,6 @@ def noisy_frames(n: int = 6, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("codec", ["16zT", "16zP", "NONE"])
-def test_openni2_plays_what_we_write(tmp_path: Path, codec: Codec) -> None:
-    frames = noisy_frames()
-    path = write_oni_file(tmp_path / "r.oni", frames, QVGA, codec=codec)
-    played = play(path)
-    np.testing.assert_array_equal(played.frames, frames)
-    with open_recording(path) as recording:
-        np.testing.assert_array_equal(played.times_us.astype(np.int64) * 1000, recording.times_ns)
-    # the angle between the picture's edges
-    assert played.fov == pytest.approx(
-        (2 * np.arctan(160 / 285), 2 * np.arctan(120 / 287)), abs=1e-6
-    )
-
-
-@pytest.mark.parametrize("codec", ["16zT", "16zP", "NONE"])
-def test_pictures_of_a_real_camera_survive_the_way_through_openni2(
-    tmp_path: Path, reference_data: Path, codec: Codec
-) -> None:
-    with open_recording(
-        reference_data / "depth_files" / "xtion_open3d", camera=XTION, fps=30
-    ) as pictures:
-        stored = np.stack([frame.depth for frame in pictures]).astype(np.uint16)
-    path = write_oni_file(tmp_path / "r.oni", stored, XTION, codec=codec)
-    np.testing.assert_array_equal(play(path).frames, stored)
-    with open_recording(path, strict=True) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], stored)
-
-
-@pytest.mark.parametrize("codec", ["16zT", "16zP", "NONE"])
 @pytest.mark.parametrize(("old", "table"), [(False, True), (True, True), (True, False)])
 def test_openni2_and_we_read_the_same_from_files_of_any_version(
     tmp_path: Path, codec: str, old: bool, table: bool
@@ -68,17 +40,6 @@ def test_openni2_and_we_read_the_same_from_files_of_any_version(
         assert recording.times_ns.tolist() == (played.times_us * 1000).tolist()
         fov = (2 * np.arctan(32 / recording.camera.fx), 2 * np.arctan(24 / recording.camera.fy))
         assert played.fov == pytest.approx(fov, abs=1e-6)
-
-
-def test_openni2_and_we_read_the_same_part_of_a_cropped_picture(tmp_path: Path) -> None:
-    payloads = [plain_payload(frame, "16zP") for frame in depth_frames(3, 40, 20)]
-    path = depth_builder(payloads, "16zP", crop=cropping(5, 10, 40, 20)).write(tmp_path / "r.oni")
-    played = play(path)
-    assert played.frames.shape == (3, 20, 40)
-    with open_recording(path) as recording:
-        np.testing.assert_array_equal(
-            [frame.depth[10:30, 5:45] for frame in recording], played.frames
-        )
 
 
 def test_we_read_what_openni2_records_of_its_dummy_device(tmp_path: Path) -> None:

@@ -12,12 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.formats.images.raytrix import (
     Profile,
-    read_ray_calibration,
     shipped_profiles,
 )
 from tests.recordings.asking import refusal
@@ -182,7 +180,6 @@ def test_virtual_depth_without_a_calibration_is_refused_with_the_reason(tmp_path
     assert "virtual, which is relative" in sentence
     assert "lens_f_mm" in sentence
     (folder / "grid.xml").write_text(CALIBRATION)
-    assert "tcp = 2.250" in refusal(folder)
     assert "no metric scale" in refusal(folder)
 
 
@@ -249,18 +246,3 @@ def test_points_need_a_camera_with_a_size(tmp_path: Path) -> None:
         assert recording.frame(0).depth.shape == (24, 32)
     (folder / "raytrix.toml").write_text('profile = "raytrix-points-mm"\npattern = "*.ply"')
     assert "'*.ply'" in refusal(folder, camera=SMALL)
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("", "no element"),
-        ("<a/>", "<a>"),
-        ("<RayCalibData/>", "could not convert"),
-        (CALIBRATION[:-20], "unclosed|mismatched|no"),
-    ],
-)
-def test_a_calibration_of_something_else_is_told(tmp_path: Path, text: str, says: str) -> None:
-    (tmp_path / "a.xml").write_text(text)
-    with pytest.raises(RecordingError, match=says):
-        read_ray_calibration(tmp_path / "a.xml")

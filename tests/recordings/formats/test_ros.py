@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from rosbags import rosbag1
 from rosbags.highlevel import AnyReader
 
 from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.recordings import open_recording
-from tests.recordings.asking import opened_or_refused, refusal
+from tests.recordings.asking import refusal
 from tests.recordings.ros_writers import (
     How,
     ros_messages,
@@ -24,7 +23,7 @@ from tests.recordings.ros_writers import (
     write_db3,
     write_ros_mcap,
 )
-from tests.recordings.writers import SMALL, START_NS, cut, depth_frames, even_times
+from tests.recordings.writers import SMALL, START_NS, depth_frames, even_times
 
 STORED = depth_frames(9)
 FLOATS = STORED.astype(np.float32) / 1000
@@ -232,47 +231,6 @@ def test_a_realsense_recording_states_its_unit(
     path = write_bag(tmp_path / "r.bag", STORED, kind="mono16", topics=(topic,), unit_m=unit_m)
     with open_recording(path) as recording:
         np.testing.assert_allclose(recording.frame(1).depth, STORED[1] * step_mm, rtol=1e-6)
-
-
-@pytest.mark.parametrize("share", np.linspace(0.02, 0.99, 15).round(3).tolist())
-@pytest.mark.parametrize(
-    ("compression", "n_lost"), [("lz4", 13), (None, 3)]
-)  # lz4 packs 64 kB at once: 11 pictures
-def test_a_cut_bag_gives_the_frames_that_are_whole(
-    tmp_path: Path, share: float, compression: str | None, n_lost: int
-) -> None:
-    """Also those of the chunk in which it was cut; `rosbags` refuses every one of these files."""
-    stored = depth_frames(40)
-    path = write_bag(tmp_path / "r.bag", stored, compression=compression, chunk_bytes=1 << 20)
-    cut(path, share)
-    with pytest.raises(rosbag1.ReaderError):
-        rosbag1.Reader(path).open()
-    recording, sentence = opened_or_refused(path)
-    if recording is None:
-        assert "the file is cut or damaged" in sentence
-        assert share * len(stored) < n_lost
-        return
-    with recording:
-        assert recording.truncated
-        assert len(recording) >= int(share * len(stored)) - n_lost
-        np.testing.assert_array_equal(
-            [frame.depth for frame in recording], stored[: len(recording)]
-        )
-
-
-def test_a_cut_db3_gives_frames_or_a_sentence(tmp_path: Path) -> None:
-    path = next(write_db3(tmp_path / "r", STORED).glob("*.db3"))
-    for share in (0.9, 0.6, 0.3, 0.01):
-        part = cut(path, share, tmp_path / "cut.db3")
-        recording, sentence = opened_or_refused(part)
-        if recording is None:
-            assert "cut.db3" in sentence
-            continue
-        with recording:
-            assert recording.truncated
-            np.testing.assert_array_equal(
-                [frame.depth for frame in recording], STORED[: len(recording)]
-            )
 
 
 @pytest.mark.parametrize(

@@ -683,7 +683,7 @@ def _list_pages(path: Path) -> tuple[list[_Page], bool]:
     except RecordingError:
         if not any(page.whole for page in listed):
             raise
-    except Exception:  # noqa: S110  # nosec B110: the directory of a cut file is garbage
+    except Exception:  # nosec B110: the directory of a cut file is garbage
         pass
     # a damaged directory, or an image of another kind after the depth: the stack ends before it
     return listed, False

@@ -231,8 +231,8 @@ def read_profile(path: Path) -> Profile:
 
 _LOOKS_LIKE = ("*depthmap*.*", "*depth3d*.*", "*.xyz", "*.ply")  # names of exports
 _NO_SCALE = (
-    " (the Raytrix calibration in it holds the micro-lens grid in virtual depth, but no focal length "
-    "and no metric scale)"
+    " (the Raytrix calibration in it holds the micro-lens grid in virtual depth, but no focal "
+    "length and no metric scale)"
 )
 
 
@@ -375,9 +375,22 @@ _PLY = ".ply"
 _CLOUD_SUFFIXES = (".xyz", ".txt", ".csv", ".asc", _PLY)
 _HEAD_BYTES = 1 << 16
 _TYPES = {  # PLY's name of a type: NumPy's
-    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2"},
-    **{"ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
-    **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
 }
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 

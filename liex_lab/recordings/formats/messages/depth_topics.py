@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from os.path import commonprefix
+from itertools import takewhile
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -643,7 +643,7 @@ def _calibrations_of(
         if topic.frame_id and first.frame_id == topic.frame_id
     ]
     for some in (same_frame, list(usable)):
-        near = {name: len(commonprefix([_branch(topic.name), _branch(name)])) for name in some}
+        near = {name: _n_shared(topic.name, name) for name in some}
         nearest = [name for name in some if near[name] == max(near.values())]
         numbers = {(c.k, c.d, c.width, c.height) for c in map(firsts.get, nearest) if c}
         if len(numbers) == 1 and (len(some) == 1 or near[nearest[0]] > 0):
@@ -657,6 +657,7 @@ def _is_usable(calibration: Calibration) -> bool:
     return len(k) == 9 and bool(np.isfinite(k).all()) and k[0] > 0 and k[4] > 0
 
 
-def _branch(topic: str) -> list[str]:
-    """The words of a topic without the last one."""
-    return topic.strip("/").split("/")[:-1]
+def _n_shared(one: str, other: str) -> int:
+    """Number of common leading words of two topics."""
+    words = (topic.strip("/").split("/")[:-1] for topic in (one, other))
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(*words, strict=False)))
