@@ -39,34 +39,30 @@ _WORDS: dict[str, tuple[str, ...]] = {  # keys with a fixed set of values
 _KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
 
 
-def _is_size(value: Any) -> bool:
-    return bool(value >= 1 and value == int(value))
-
-
-def _is_focal(value: Any) -> bool:
-    return bool(1e-3 < value < 1e7)  # limits far beyond any camera
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and value != ""
-
-
-def _is_column(value: Any) -> bool:
-    return _is_text(value) or (type(value) is int and value >= 0)
-
-
-_TEXT = (_is_text, "it is a text in quotation marks")
+_TEXT = (
+    lambda value: isinstance(value, str) and value != "",
+    "it is a text in quotation marks",
+)
 _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {  # key: valid values, and how to state them
-    **dict.fromkeys(("width", "height"), (_is_size, "it is a positive whole number of pixels")),
+    **dict.fromkeys(
+        ("width", "height"),
+        (
+            lambda value: value >= 1 and value == int(value),
+            "it is a positive whole number of pixels",
+        ),
+    ),
     **dict.fromkeys(
         ("fx", "fy"),
         (
-            _is_focal,
+            lambda value: 1e-3 < value < 1e7,  # limits far beyond any camera
             "a focal length is a positive number of pixels, some hundreds of most cameras",
         ),
     ),
     "unit_mm": (bool, "it is the number of millimetres in one stored step"),
-    "time_column": (_is_column, "it is a column's name, or its number from 0"),
+    "time_column": (
+        lambda value: value != "" if isinstance(value, str) else type(value) is int and value >= 0,
+        "it is a column's name, or its number from 0",
+    ),
     **dict.fromkeys(("timestamps", "pattern", "subject_id", "distortion_model"), _TEXT),
     **{
         key: (words.__contains__, "it is one of " + ", ".join(f'"{word}"' for word in words))

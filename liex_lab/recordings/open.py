@@ -43,38 +43,37 @@ _FILES = (
 _RENDERED = "synthetic:"
 _RENDERER = "liex_lab.simulation.address"
 _MCAP = b"\x89MCAP0\r\n"
-_RAYTRIX = (
-    "is in Raytrix's own format, which only the maker's licensed software reads; compute metric "
-    "depth in RxLive, save "
-    "the depth map of every frame as 32-bit TIFF (or its points as XYZ or PLY) into one folder, "
-    "write a raytrix.toml "
-    'with the line profile = "raytrix-f32-negative-mm" into it, and give that folder'
-)
-_CLOUD = (
-    "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that says "
-    "what its numbers "
-    'mean, with a line such as profile = "raytrix-points-mm", and give the folder'
-)
-_EIGHT_BIT = (
-    "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give "
-    "the depth itself"
-)
-_NOT_YET = "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame"
 _PACKED = "is packed, and only .tar.gz is read as it is; unpack it{} and give the result"
-_TRACKS = (
-    "is a database, such as Live Mouse Tracker's, with tracks but without depth images; give the "
-    "depth recording itself"
-)
 _NOT_READ = {
     **dict.fromkeys((".zstd", ".zst"), _PACKED.format(" with `zstd -d`")),
-    **dict.fromkeys((".ray", ".rays"), _RAYTRIX),
-    **dict.fromkeys((".ply", ".xyz"), _CLOUD),
-    **dict.fromkeys(
-        (".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"), _EIGHT_BIT
-    ),
-    **dict.fromkeys((".h5", ".npy", ".npz", ".rrd", ".xef", ".svo", ".svo2"), _NOT_YET),
     **dict.fromkeys((".zip", ".gz", ".xz", ".bz2", ".7z", ".rar"), _PACKED.format("")),
-    **dict.fromkeys((".sqlite", ".sqlite3", ".db"), _TRACKS),
+    **dict.fromkeys(
+        (".ray", ".rays"),
+        "is in Raytrix's own format, which only the maker's licensed software reads; compute "
+        "metric depth in RxLive, save the depth map of every frame as 32-bit TIFF (or its points "
+        "as XYZ or PLY) into one folder, write a raytrix.toml with the line profile = "
+        '"raytrix-f32-negative-mm" into it, and give that folder',
+    ),
+    **dict.fromkeys(
+        (".ply", ".xyz"),
+        "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that "
+        'says what its numbers mean, with a line such as profile = "raytrix-points-mm", and give '
+        "the folder",
+    ),
+    **dict.fromkeys(
+        (".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"),
+        "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give "
+        "the depth itself",
+    ),
+    **dict.fromkeys(
+        (".h5", ".npy", ".npz", ".rrd", ".xef", ".svo", ".svo2"),
+        "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame",
+    ),
+    **dict.fromkeys(
+        (".sqlite", ".sqlite3", ".db"),
+        "is a database, such as Live Mouse Tracker's, with tracks but without depth images; give "
+        "the depth recording itself",
+    ),
 }
 
 

@@ -25,7 +25,7 @@ from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from threading import Lock
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from isal import igzip_threaded, isal_zlib
@@ -477,32 +477,14 @@ def read_session_stamps(
     return stamps
 
 
-class Mode(NamedTuple):
-    """A depth mode.
-
-    Attributes:
-        name: its name in the Azure Kinect sensor SDK.
-        width: columns of its images, px.
-        height: rows of its images, px.
-        side: side of the sensor after binning, px.
-        left: column of the image's corner on the sensor, px.
-        top: row of the image's corner on the sensor, px.
-    """
-
-    name: str
-    width: int
-    height: int
-    side: int
-    left: int
-    top: int
-
-
-MODES = (  # of the Azure Kinect sensor SDK
-    Mode("NFOV_UNBINNED", 640, 576, 1024, 192, 180),
-    Mode("NFOV_2X2BINNED", 320, 288, 512, 96, 90),
-    Mode("WFOV_2X2BINNED", 512, 512, 512, 0, 0),
-    Mode("WFOV_UNBINNED", 1024, 1024, 1024, 0, 0),
-)
+# columns and rows of a depth mode's images, px: its name in the Azure Kinect SDK, the side of
+# the sensor after binning, and column and row of the image's corner on the sensor, px
+MODES = {
+    (640, 576): ("NFOV_UNBINNED", 1024, 192, 180),
+    (320, 288): ("NFOV_2X2BINNED", 512, 96, 90),
+    (512, 512): ("WFOV_2X2BINNED", 512, 0, 0),
+    (1024, 1024): ("WFOV_UNBINNED", 1024, 0, 0),
+}
 _TYPICAL = (
     0.5,
     0.5,
@@ -514,11 +496,6 @@ _DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth
 
 # cx, cy, fx, fy as shares of the sensor's side, and k1 k2 p1 p2 k3 k4 k5 k6
 FactoryLens = tuple[tuple[float, ...], tuple[float, ...]]
-
-
-def mode_of(width: int, height: int) -> Mode | None:
-    """The depth mode with images of a given size, px; None if absent."""
-    return next((mode for mode in MODES if (mode.width, mode.height) == (width, height)), None)
 
 
 def read_calibration(data: bytes) -> FactoryLens | None:
@@ -546,30 +523,30 @@ def read_calibration(data: bytes) -> FactoryLens | None:
     return (cx, cy, fx, fy), (k1, k2, p1, p2, k3, k4, k5, k6)
 
 
-def azure_camera(mode: Mode, lens: FactoryLens | None) -> Camera:
+def azure_camera(size: Size, lens: FactoryLens | None) -> Camera:
     """The camera of a depth mode, in pixels of its images.
 
     Pixel (0, 0) is the centre of the top-left pixel, hence the half that is subtracted.
 
     Args:
-        mode: the depth mode.
+        size: of the mode's images, a key of `MODES`.
         lens: the factory calibration; None for typical values, which differ by about 1 % between
             units.
 
     Returns:
         The camera, with distortion if lens is given.
     """
-    shares, bent = (_TYPICAL, ()) if lens is None else lens
-    cx, cy, fx, fy = (share * mode.side for share in shares)
+    name, side, left, top = MODES[size]
+    shares, bent = lens or (_TYPICAL, ())
+    cx, cy, fx, fy = (share * side for share in shares)
     source = "the camera's factory calibration in the file"
     return Camera(
         fx,
         fy,
-        cx - mode.left - 0.5,
-        cy - mode.top - 0.5,
-        mode.width,
-        mode.height,
-        source if lens else f"typical Azure Kinect, {mode.name}",
+        cx - left - 0.5,
+        cy - top - 0.5,
+        *size,
+        source if lens else f"typical Azure Kinect, {name}",
         distortion=Distortion.of("rational_polynomial", bent),
     )
 
@@ -830,19 +807,19 @@ class _Session:
         width, height = stack.width, stack.height
         if self.stated_camera is not None or self.camera_file.intrinsics:
             return self.camera_file.camera(width, height, self.stated_camera)
-        mode = mode_of(width, height)
         attached = () if video is None else video.attachments
         lens = next(filter(None, map(read_calibration, attached)), None)
-        if mode is not None and lens is not None:
-            return azure_camera(mode, lens)
+        if (width, height) in MODES and lens is not None:
+            return azure_camera((width, height), lens)
         # no other camera has a Kinect v2's size
         kind = self.metadata.camera or KINECT
         if video is not None and any(name.startswith("K4A_") for name in video.tags):
             kind = AZURE
         if kind == KINECT and (width, height) == _KINECT_V2_SIZE:
             typical, name = KINECT_V2, "Kinect v2"
-        elif kind == AZURE and mode is not None:
-            typical, name = azure_camera(mode, None), f"Azure Kinect in the mode {mode.name}"
+        elif kind == AZURE and (width, height) in MODES:
+            typical = azure_camera((width, height), None)
+            name = f"Azure Kinect in the mode {MODES[width, height][0]}"
         else:
             whose = f"the camera {self.metadata.camera_name!r}"
             raise RecordingError(
