@@ -363,7 +363,6 @@ PRESETS = {
     "raytrix-r5": (RAYTRIX_R5,),
 }
 
-_LIKE = 0.1  # specimens, and images mapped to another lens, differ by less
 # sizes of few kinds of camera; for others, no lens is unusual
 _DISTINCTIVE = ((640, 480), (512, 424), (320, 240), (640, 576))
 
@@ -430,7 +429,8 @@ def unusual_lens(camera: Camera) -> str:
         for one in cameras
         if (one.width, one.height) == size and size in _DISTINCTIVE
     }
-    if not usual_px or any(abs(camera.fx / fx - 1.0) <= _LIKE for fx in usual_px.values()):
+    # specimens, and images mapped to another lens, differ by less
+    if not usual_px or any(abs(camera.fx / fx - 1.0) <= 0.1 for fx in usual_px.values()):
         return ""
     usual = ", ".join(f"{name} {fx:.0f}" for name, fx in usual_px.items())
     return (
@@ -477,9 +477,6 @@ def unusual_centre(camera: Camera) -> tuple[str, bool]:
 # Quality of a recording's depth sensor: noise, steps, unread edges, mixed pixels.
 
 
-_QUIET_MM = 0.05  # no sensor is so quiet
-
-
 @dataclass(frozen=True)
 class SensorCard:
     """The depth sensor of one recording.
@@ -510,7 +507,8 @@ class SensorCard:
     def __str__(self) -> str:
         """One readable line."""
         noise = ", ".join(f"{sd:.1f} mm at {depth / 1000:.2f} m" for depth, sd in self.noise)
-        if self.noise and max(sd for _, sd in self.noise) < _QUIET_MM:
+        # no sensor is so quiet
+        if self.noise and max(sd for _, sd in self.noise) < 0.05:
             noise = "none, as of filtered or composed images"
         parts = [f"noise {noise or 'unknown'}"]
         if self.step_mm is not None:

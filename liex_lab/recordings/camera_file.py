@@ -30,13 +30,23 @@ WHAT_TO_WRITE = (
 )
 _INTRINSICS = ("fx", "fy", "cx", "cy")
 _NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
-_TEXTS = ("timestamps", "pattern", "subject_id", "session_start_time", "distortion_model")
 _WORDS: dict[str, tuple[str, ...]] = {  # keys with a fixed set of values
     "encoding": tuple(ENCODINGS),
     "byte_order": ("big", "little"),
     "time_unit": tuple(UNITS),
 }
-_KEYS = (*_NUMBERS, "unread", "distortion", "time_column", *_TEXTS, *_WORDS)
+_KEYS = (
+    *_NUMBERS,
+    "unread",
+    "distortion",
+    "time_column",
+    "timestamps",
+    "pattern",
+    "subject_id",
+    "session_start_time",
+    "distortion_model",
+    *_WORDS,
+)
 
 
 _TEXT = (
@@ -298,7 +308,6 @@ def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:
 
 
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
-_INFRARED = {"ir", "infra", "passiveir"}
 
 
 def is_infrared(name: str) -> bool:
@@ -310,7 +319,9 @@ def is_infrared(name: str) -> bool:
         name: a name or title, without the suffix of a file name.
     """
     words = {word.lower() for word in _WORD.findall(name)}
-    found = words & _INFRARED or {word for word in words if word.startswith("infrared")}
+    found = words & {"ir", "infra", "passiveir"} or {
+        word for word in words if word.startswith("infrared")
+    }
     return bool(found) and "depth" not in words
 
 

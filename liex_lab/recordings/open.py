@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import Lens
@@ -24,7 +25,6 @@ _READS = (
     ".tar.gz), a PrimeSense recording (.oni), an MCAP file or a ROS bag (.bag, .db3)"
 )
 _PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
-_MOSEQ = ("depth.dat", "depth.avi", "depth.mkv")
 _ALONE = {  # suffix of a file that is a whole recording: its module and function
     ".tar.gz": "moseq.open_moseq",
     ".tgz": "moseq.open_moseq",
@@ -39,9 +39,6 @@ _ALONE = {  # suffix of a file that is a whole recording: its module and functio
 _FILES = (
     _ALONE | {".dat": "moseq.open_moseq"} | dict.fromkeys(_PICTURES, "images.folder.open_images")
 )
-# address of a virtual recording; rendering is a higher layer than reading, so only named here
-_RENDERED = "synthetic:"
-_RENDERER = "liex_lab.simulation.address"
 _MCAP = b"\x89MCAP0\r\n"
 _PACKED = "is packed, and only .tar.gz is read as it is; unpack it{} and give the result"
 _NOT_READ = {
@@ -92,7 +89,7 @@ class _How:
         """Open with the function `where` of `formats`, as in "oni.open_oni", imported on demand."""
         module, name = where.rsplit(".", 1)
         opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
-        more = {
+        more: dict[str, dict[str, Any]] = {
             "open_images": {"pattern": self.pattern},
             "open_bag": {"topic": self.topic},
             "open_mcap": {"topic": self.topic, "strict": self.strict},
@@ -187,8 +184,11 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
 
 
 def _open(path: Path, how: _How) -> Recording:
-    if str(path).startswith(_RENDERED):
-        rendered: Recording = import_module(_RENDERER).open_synthetic(str(path), how.camera)
+    # address of a virtual recording; rendering is a higher layer than reading, so only named here
+    if str(path).startswith("synthetic:"):
+        rendered: Recording = import_module("liex_lab.simulation.address").open_synthetic(
+            str(path), how.camera
+        )
         return rendered
     if not path.exists():
         raise RecordingError(f"there is no file or folder {path}; check the spelling")
@@ -227,7 +227,7 @@ def _open_folder(folder: Path, how: _How) -> Recording:
     inside = sorted(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
     if not inside:
         raise RecordingError(f"{folder} is an empty folder; give {_READS}")
-    if any(name in inside for name in _MOSEQ):
+    if any(name in inside for name in ("depth.dat", "depth.avi", "depth.mkv")):
         return how.open("moseq.open_moseq", folder)
     if PROFILE_FILE in inside:
         return how.open("images.raytrix.open_raytrix", folder)

@@ -23,7 +23,6 @@ from liex_lab.recordings import depth_kernels as kernels
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 
-_MUCH_LOST = 0.05  # share of an image's pixels lost at its edge
 _MAX_GROWTH = 0.15  # of an image's width or height, at each side
 
 
@@ -50,7 +49,8 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
     }
     seen = recording.seen_by(ideal_camera(camera, water), rectifier(camera, water), optics)
     lost = share_lost(camera)
-    if lost > _MUCH_LOST:
+    # share of an image's pixels lost at its edge
+    if lost > 0.05:
         seen.problems.append(
             f"{lost:.0%} of the pixels leave the picture when the lens distortion is undone; keep "
             "the animal away from the picture's edge, or check the distortion's coefficients"

@@ -30,10 +30,6 @@ _HEAD = struct.Struct("<I")  # length of the greeting, JSON
 _POLL_S = 0.02
 _GREETING_S = 10.0  # for the whole greeting
 _FRAME_S = 30.0  # for the rest of a frame that has begun
-_PATIENCE_S = 300.0  # for the next frame
-_MOST_PX = 1 << 24  # of a camera
-_LONGEST_GREETING = 1 << 20
-_MOST_WAITING = 128  # frames buffered; then the sender waits
 
 
 class Arrival(NamedTuple):
@@ -174,14 +170,15 @@ def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
     head = _exactly(link, _HEAD.size, by)
     length = _HEAD.unpack(head)[0] if head else 0
     with suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError, LiexError):
-        stated = json.loads(_exactly(link, length if length < _LONGEST_GREETING else 0, by))
+        stated = json.loads(_exactly(link, length if length < (1 << 20) else 0, by))
         name = stated["name"]
         camera = Camera.from_dict(stated["camera"])
         size = (camera.width, camera.height)
         if (
             isinstance(name, str)
             and all(type(n) is int for n in size)
-            and size[0] * size[1] <= _MOST_PX
+            # of a camera
+            and size[0] * size[1] <= (1 << 24)
         ):
             return name, camera
     raise RecordingError(
@@ -195,7 +192,8 @@ def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
 
     The time of a frame is then its arrival, not its request.
     """
-    waiting: Queue[Arrival | RecordingError | None] = Queue(_MOST_WAITING)
+    # frames buffered; then the sender waits
+    waiting: Queue[Arrival | RecordingError | None] = Queue(128)
 
     def fetch() -> None:
         try:
@@ -240,7 +238,8 @@ def _frames(link: socket.socket, camera: Camera, where: str) -> Iterator[Arrival
     """Frames of the camera's size that arrive whole and in time."""
     with link:
         while True:
-            head = _exactly(link, _FRAME.size, time.monotonic() + _PATIENCE_S)
+            # for the next frame
+            head = _exactly(link, _FRAME.size, time.monotonic() + 300.0)
             if not head:
                 return
             index, time_ns, height, width = _FRAME.unpack(head)

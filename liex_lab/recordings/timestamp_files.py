@@ -54,8 +54,6 @@ _CLOCKS = (  # nanoseconds per step, the step number of 1970, and the name
     (100, 621_355_968 * 10**9, "steps of 100 ns since the year 1, as .NET counts"),
 )
 _HOUR_NS = 3600 * 10**9
-_BLANK = re.compile(r"(?<=\d{4}-\d\d-\d\d) +(?=\d\d:)")  # between date and time
-_TIME_OF_DAY = re.compile(r"(\d\d:\d\d:\d\d),(?=\d{3})")  # with a decimal comma
 _SURE = 12  # rows: with fewer, digits after commas may be fractions that increase by chance
 _GROUPED = re.compile(r"^([-+]?[1-9]\d{0,2})[.,](\d{3})$")  # a number, or thousands
 
@@ -279,7 +277,13 @@ def read_stamps(
         RecordingError: there is no such column, its unit is unknown, or a cell is not a stamp.
     """
     try:
-        separator, lines = split_lines(_TIME_OF_DAY.sub(r"\1.", _BLANK.sub("T", read_text(path))))
+        # between date and time
+        # with a decimal comma
+        separator, lines = split_lines(
+            re.compile(r"(\d\d:\d\d:\d\d),(?=\d{3})").sub(
+                r"\1.", re.compile(r"(?<=\d{4}-\d\d-\d\d) +(?=\d\d:)").sub("T", read_text(path))
+            )
+        )
         cells = split_cells(lines, separator)
     except ValueError as error:
         raise RecordingError(

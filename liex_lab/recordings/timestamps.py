@@ -36,12 +36,10 @@ CLOCK_JUMP_NS = (
 )  # no camera drops frames for a minute: it was stopped, or its clock was set
 # frames on either side that distinguish a lasting jump from a few stamps out of order
 _SURE = 5
-_LONGEST_STEP_NS = 10**9
 LATEST_NS = 2**32 * 10**9  # the year 2106: the limit of the replay's messages
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
 # the years 2000 to 2100: other stamps do not count from 1970
 PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
-_COUNTING = 0.75  # least share of equal steps in a counter
 _NEAR = 8  # frames on either side within which frames are sorted
 _CLOSEST = 0.6  # steps between two of them
 _MOST_LOST = 8
@@ -81,7 +79,6 @@ class Gap:
 
 
 PLAUSIBLE_HZ = (0.5, 2000.0)  # of a depth camera that watches an animal
-_MOST_MOVED = 0.25  # most stamps repeated or out of order, as on a busy computer
 FAULTS = ("", "stamp_repeated", "stamp_out_of_order", JUMPED)  # indexed by `MonotoneTimes.faults`
 # their indices
 _REPEATED, _OUT_OF_ORDER, _JUMPED = range(1, len(FAULTS))
@@ -229,7 +226,8 @@ def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
             "in another unit than it says, and speeds and durations are wrong by that"
         )
     n_moved = int(np.isin(faults, (_REPEATED, _OUT_OF_ORDER)).sum())
-    if n_moved > _MOST_MOVED * len(faults):
+    # most stamps repeated or out of order, as on a busy computer
+    if n_moved > 0.25 * len(faults):
         found.append(
             f"{n_moved} of {len(faults)} time stamps are repeated or out of order: times are "
             "guesses, and speeds with them"
@@ -315,7 +313,8 @@ def frame_counts(numbers: Times, step: int | None = None) -> Times | None:
     """
     steps = np.diff(numbers)
     sizes, often = np.unique(steps, return_counts=True)
-    if len(steps) < 2 or often.max() < _COUNTING * len(steps):
+    # least share of equal steps in a counter
+    if len(steps) < 2 or often.max() < 0.75 * len(steps):
         return None
     usual = int(sizes[often.argmax()])
     if usual <= 0 or step not in (None, usual):
@@ -462,7 +461,7 @@ def _fewest_moved(times_ns: Times) -> Times:
     keep = _first_of_equal(times_ns, slack, _longest_nondecreasing(slack.tolist()))
     monotone = times_ns.copy()
     kept = times_ns[keep]
-    step = min(median_step(kept) or 1, _LONGEST_STEP_NS)
+    step = min(median_step(kept) or 1, (10**9))
     monotone[: keep[0]] = int(kept[0]) - step * np.arange(int(keep[0]), 0, -1)
     monotone[keep[-1] + 1 :] = int(kept[-1]) + step * np.arange(1, len(times_ns) - int(keep[-1]))
     for n in np.flatnonzero(np.diff(keep) > 1):

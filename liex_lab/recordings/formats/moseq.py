@@ -58,10 +58,7 @@ if TYPE_CHECKING:
 
 _PACKED = 1 << 18  # packed bytes read at once
 _UNPACKED = 1 << 17  # bytes unpacked at once: an empty image is a thousand times its packed size
-_ALWAYS = 1 << 29  # bytes unpacked at any compression ratio
 _MOST_TIMES = 200  # compression ratio beyond that: true images have noise
-_MOST_HEADER = 1 << 20  # bytes of a member's name or notes
-_MOST_NOTES = 1 << 28  # bytes of any file but the images: stamps of days
 _GZIP_MAGIC = b"\x1f\x8b"
 Pieces = Generator[bytes | memoryview, None, None]
 
@@ -83,7 +80,8 @@ class _Member(tarfile.TarInfo):
                 "the archive has a file with holes in it (GNU sparse); pack the session's folder "
                 "again, without --sparse"
             )
-        if self.type in self._LONG and self.size > _MOST_HEADER:
+        # bytes of a member's name or notes
+        if self.type in self._LONG and self.size > (1 << 20):
             raise RecordingError(
                 f"the archive has a name or note of {self.size} bytes, which no recording has; "
                 "pack the session's folder again"
@@ -137,7 +135,8 @@ class _ArchiveBytes:
                 return b""
             self._piece = memoryview(piece)
             self._n_read += len(piece)
-            if self._n_read > _ALWAYS and self._n_read > _MOST_TIMES * max(packed, 1):
+            # bytes unpacked at any compression ratio
+            if self._n_read > (1 << 29) and self._n_read > _MOST_TIMES * max(packed, 1):
                 raise RecordingError(
                     f"the archive unpacks to more than {_MOST_TIMES} times its size, which no "
                     "recording does; pack the session's folder again"
@@ -274,7 +273,8 @@ def _check_size(archive: Path, member: tarfile.TarInfo, folder: Path) -> None:
             f"{archive} has a file with holes in it, {name}; pack the session's folder again"
         )
     is_note = PurePosixPath(name).suffix in (".json", ".txt", ".csv", ".toml")
-    if is_note and member.size > _MOST_NOTES:
+    # bytes of any file but the images: stamps of days
+    if is_note and member.size > (1 << 28):
         raise RecordingError(
             f"{archive} has a {name} of {member.size / 1e9:.1f} GB, which holds no stamps or "
             "notes; pack the session's folder again"
@@ -552,10 +552,8 @@ def azure_camera(size: Size, lens: FactoryLens | None) -> Camera:
 
 
 DEPTH = "depth.dat"
-VIDEOS = ("depth.avi", "depth.mkv")
-DEPTHS = (DEPTH, *VIDEOS)
+DEPTHS = (DEPTH, "depth.avi", "depth.mkv")
 _NOMINAL_HZ = 30.0  # rate of every camera that MoSeq supports
-_SURPLUS = 0.05  # share of extra stamps: recorders also write those of frames without infrared
 _KINECT_V2_SIZE = (512, 424)
 _OTHER_SIZES = (
     (640, 480),
@@ -848,7 +846,8 @@ class _Session:
             if len(stamps) == n or own is None or own.even:
                 extra = len(stamps) - n
                 self.problems += match_counts(n, len(stamps), self.depth.name, name)
-                if not 0 <= extra <= (len(stamps) if stack.truncated else max(3, _SURPLUS * n)):
+                # share of extra stamps: recorders also write those of frames without infrared
+                if not 0 <= extra <= (len(stamps) if stack.truncated else max(3, 0.05 * n)):
                     self.doubts.append(unpaired(self.depth.name, name))
                 return stamps[:n]
             self.problems.append(

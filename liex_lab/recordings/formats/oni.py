@@ -38,27 +38,17 @@ from liex_lab.recordings.timestamps import (
 )
 from liex_lab.runtime.progress import Progress, silent
 
-_FILE_MAGIC = b"NI10"
 _FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (4 numbers), last time, highest node id
-_OLDEST = (1, 0, 0, 4)
 _NEWEST = (1, 0, 1, 0)  # before it, positions in the file have 32 bits
 
 _RECORD_MAGIC = 0x0052494E  # "NIR" and a zero byte
 _HEADER = struct.Struct("<IIIIIQ")
 _OLD_HEADER = struct.Struct("<IIIIII")
 _OLD_NODE = 0x02
-_NODES = (_OLD_NODE, 0x0C, 0x0D)
-_PROPERTIES = (0x03, 0x04, 0x05, 0x06)  # integer, real, text, bytes
 _FRAME = 0x0A
-_END = 0x0B
-_KINDS = range(_OLD_NODE, 0x0F)
-_DEPTH_NODE = 2  # 1 is the device, 3 colour, 4 infrared
 _FRAME_FIELDS = struct.Struct("<QI")  # time in µs, number of the frame, counted from 1
 _NODE_FIELDS = struct.Struct("<i4s")  # kind, codec
 _UNKNOWN_COUNT = 0xFFFFFFFF
-_USUAL_FIELDS = 64
-_MOST_FIELDS = 4096  # bytes read of names and numbers
-_BLOCK = 1 << 20
 
 MODE = "xnMapOutputMode"
 CROPPING = "xnCropping"
@@ -81,9 +71,6 @@ _USED = (
     PLANE_PIXEL,
     INTRINSICS,
 )
-_LARGEST_VALUE = 64  # bytes; the used properties have at most 32
-_MANY = 100
-_MILLIMETRES = 100  # the pixel format if none is stated
 
 
 class Record(NamedTuple):
@@ -127,11 +114,11 @@ class OniFile:
         head = self._file.read(_FILE_HEADER.size)
         version = _FILE_HEADER.unpack(head)[1:5] if len(head) == _FILE_HEADER.size else (0,)
         self._header = _OLD_HEADER if version < _NEWEST else _HEADER
-        if version == (0,) or not head.startswith(_FILE_MAGIC):
+        if version == (0,) or not head.startswith(b"NI10"):
             raise RecordingError(
                 f"{path} is named like an .oni file but holds something else; give another file"
             )
-        if not _OLDEST <= version <= _NEWEST:
+        if not (1, 0, 0, 4) <= version <= _NEWEST:
             raise RecordingError(
                 f"{path} says that it is of version {'.'.join(map(str, version))} of its format, "
                 "and versions 1.0.0.4 to 1.0.1.0 can be read; record it again with OpenNI2, or "
@@ -154,7 +141,7 @@ class OniFile:
         reported = -1
         self.whole = record is not None and record.at == _FILE_HEADER.size
         while record is not None:
-            ended = record.kind == _END
+            ended = record.kind == 0x0B  # the record at the end
             following = self._record_at(record.end) if record.end < self.size else None
             if following is None and record.end != self.size:
                 following = self._search(record.at + self._header.size)
@@ -174,24 +161,25 @@ class OniFile:
 
     def _record_at(self, at: int) -> Record | None:
         header = self._header
-        raw = self.read(at, header.size + _USUAL_FIELDS)
+        raw = self.read(at, header.size + 64)
         if len(raw) < header.size:
             return None
         magic, kind, node, size, payload_size, _ = header.unpack_from(raw)
         n_fields = size - header.size
-        if magic != _RECORD_MAGIC or kind not in _KINDS or n_fields < 0:
+        if magic != _RECORD_MAGIC or kind not in range(_OLD_NODE, 0x0F) or n_fields < 0:
             return None
         if kind == _FRAME and n_fields != _FRAME_FIELDS.size:
             return None
         if n_fields > len(raw) - header.size:
-            raw = self.read(at, header.size + min(n_fields, _MOST_FIELDS))
+            # bytes read of names and numbers
+            raw = self.read(at, header.size + min(n_fields, 4096))
         return Record(at, kind, node, size, payload_size, raw[header.size : size])
 
     def _search(self, start: int) -> Record | None:
         """The first record from a position that is within the file."""
         magic = _RECORD_MAGIC.to_bytes(4, "little")
         while start + self._header.size <= self.size:
-            block = self.read(start, _BLOCK)
+            block = self.read(start, 1 << 20)
             found = block.find(magic)
             while found >= 0:
                 record = self._record_at(start + found)
@@ -271,7 +259,8 @@ class DepthNode:
         cropped, *crop = self.numbers(CROPPING, "<IHHHH") or (0,)
         part = (crop[0], crop[1], crop[2], crop[3]) if cropped else (0, 0, width, height)
         unit = self.number(UNIT)
-        constant = (width, height, _MILLIMETRES if unit is None else unit)
+        # the pixel format if none is stated
+        constant = (width, height, 100 if unit is None else unit)
         return FrameFormat(constant, part, bool(self.number(MIRROR)), fps)
 
 
@@ -285,23 +274,26 @@ def index_file(file: OniFile, progress: Progress) -> tuple[list[DepthNode], set[
     sound = True
     for record in file.walk(progress):
         try:
-            if record.kind in _NODES:
+            if record.kind in (_OLD_NODE, 0x0C, 0x0D):  # all three add a node
                 name, rest = _text(record.fields)
                 kind, codec = _NODE_FIELDS.unpack_from(rest)
                 n_stated = _UNKNOWN_COUNT
                 if record.kind != _OLD_NODE:
                     n_stated, *_ = struct.unpack_from("<IQQ", rest, _NODE_FIELDS.size)
-                if kind == _DEPTH_NODE:
+                # 1 is the device, 3 colour, 4 infrared
+                if kind == 2:
                     stated = None if n_stated == _UNKNOWN_COUNT else n_stated
                     depth.setdefault(record.node, DepthNode(name, codec, stated))
-                elif len(others) < _MANY:
+                elif len(others) < 100:
                     others.add(name)
             elif (node := depth.get(record.node)) is None:
                 continue
-            elif record.kind in _PROPERTIES:
+            # integer, real, text, bytes
+            elif record.kind in (0x03, 0x04, 0x05, 0x06):
                 name, rest = _text(record.fields)
                 (size,) = struct.unpack_from("<I", rest)
-                if name in _USED and len(value := rest[4 : 4 + size]) <= _LARGEST_VALUE:
+                # bytes; the used properties have at most 32
+                if name in _USED and len(value := rest[4 : 4 + size]) <= 64:
                     node.properties[name] = value
                     node.format_now = None
             elif record.kind == _FRAME and record.payload_size:
@@ -321,17 +313,11 @@ def _text(fields: bytes) -> tuple[str, bytes]:
 RAW = b"NONE"
 WITH_TABLE = b"16zT"
 _UNIT_MM = {100: 1.0, 101: 0.1}  # OpenNI's pixel formats of depth
-_SHIFTS = (102, 103)
-_MOST_PIXELS = 1 << 24  # limits the memory for a frame with a damaged header
 _LATEST_US = 2**62 // 1000
-_NOMINAL_HZ = 30.0
-_N_PROBED = 5
 
 # of PrimeSense's reference design: 120 mm / (2 x 0.1052 mm)
 _VGA_FOCAL = 570.342
 _VGA_WIDTH = 640
-_SENSOR_WIDTH = 1280  # columns of the sensor for which ZPPS states the pixel size
-_USUAL_SIZES = ((160, 120), (320, 240), (640, 480), (1280, 960), (1280, 1024))
 _FIELDS_OF_VIEW = (math.radians(5.0), math.radians(170.0))
 
 
@@ -436,7 +422,7 @@ def _open(
     monotone = in_order_of_sensor(_times(node, form, fps, problems))
     problems += [monotone.problem] if monotone.problem else []
     read = _frame_reader(file, node, form, camera_file)
-    probed = np.linspace(0, n - 1, min(n, _N_PROBED)).astype(int).tolist()
+    probed = np.linspace(0, n - 1, min(n, 5)).astype(int).tolist()
     if all(isinstance(read(i), str) for i in probed):
         raise RecordingError(
             f"{path} states pictures of {width} x {height} pixels, but its frames do not "
@@ -495,13 +481,14 @@ def _format(path: Path, node: DepthNode, problems: list[str]) -> FrameFormat:
             f"{path} does not state the size of its pictures (xnMapOutputMode); copy it again"
         )
     width, height, unit = form.constant
-    if not 0 < width * height <= _MOST_PIXELS:
+    # limits the memory for a frame with a damaged header
+    if not 0 < width * height <= (1 << 24):
         raise RecordingError(
             f"{path} states pictures of {width} x {height} pixels, which no depth camera "
             "has; it is damaged, so copy it again"
         )
     if unit not in _UNIT_MM:
-        what = "the sensor's raw shifts" if unit in _SHIFTS else f"the unit {unit}"
+        what = "the sensor's raw shifts" if unit in (102, 103) else f"the unit {unit}"
         raise RecordingError(
             f"{path} holds {what} (oniPixelFormat), and depth in steps of 1 mm or 0.1 mm can be "
             "read; record it again as depth"
@@ -532,7 +519,7 @@ def _times(node: DepthNode, form: FrameFormat, fps: float | None, problems: list
     n = len(stamps)
     if n > 1 and np.all(stamps == stamps[0]):
         stated = rate(fps, "the call")
-        hz = stated or float(form.fps if 0 < form.fps <= 1000 else _NOMINAL_HZ)
+        hz = stated or float(form.fps if 0 < form.fps <= 1000 else 30.0)
         origin = (
             "as stated"
             if stated
@@ -573,9 +560,15 @@ def _camera(
     ours = node.numbers(INTRINSICS, "<dddd")
     if ours is not None and np.isfinite(ours).all() and _can_be(ours[:2], (width, height)):
         source = f"intrinsics in the .oni file ({INTRINSICS})"
-        return Camera(*ours, width, height, source=source)
+        return Camera(ours[0], ours[1], ours[2], ours[3], width, height, source=source)
     focal, source = _stated_focal(node, (width, height), problems)
-    if focal is None and (width, height) in _USUAL_SIZES:
+    if focal is None and (width, height) in (
+        (160, 120),
+        (320, 240),
+        (640, 480),
+        (1280, 960),
+        (1280, 1024),
+    ):
         focal = (_VGA_FOCAL * width / _VGA_WIDTH,) * 2
         source = "typical PrimeSense"
         problems.append(
@@ -608,7 +601,8 @@ def _stated_focal(
     distance = node.number(PLANE_DISTANCE)
     pixel = node.numbers(PLANE_PIXEL, "<d")
     if distance is not None and pixel is not None and pixel[0] > 0:
-        focal = distance / pixel[0] * size[0] / _SENSOR_WIDTH
+        # columns of the sensor for which ZPPS states the pixel size
+        focal = distance / pixel[0] * size[0] / 1280
         found.append(((focal, focal), "lens in the .oni file (ZPD and ZPPS)"))
     for focal_lengths, source in found:
         if _can_be(focal_lengths, size):

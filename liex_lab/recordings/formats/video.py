@@ -31,12 +31,8 @@ from liex_lab.runtime.progress import Progress
 
 _FFV1 = "ffv1"
 _RAW = {"gray16be": ">u2", "gray16le": "<u2"}  # FFmpeg's name of the pixels: NumPy's
-# least start value of an FFV1 key frame: its first coded bit is 1
-_KEY = 0x7F80
-_N_PROBED = 3  # key frames, one of which must be depth: the first may be damaged
 
 _CHUNK = struct.Struct("<4sI")  # name, length of what follows
-_LISTS = (b"AVI ", b"AVIX", b"hdrl", b"strl", b"movi", b"rec ")  # traversed
 
 _SEGMENT = 0x18538067
 _CLUSTER = 0x1F43B675
@@ -50,7 +46,6 @@ _OTHERS = (
     *(0xA7, 0xAB, 0x5854, 0x9B, 0xFB, 0xFA, 0xA4, 0x75A1, 0x75A2, 0x8E),  # in clusters and groups
 )
 _LACING = 0x06  # flags of a block with several frames, which depth recorders do not write
-_MOST_TICKS = 2**60  # a clock beyond that is damage
 
 
 class _Walk:
@@ -83,7 +78,15 @@ class _Walk:
         while at + _CHUNK.size <= self._size:
             name, length = _CHUNK.unpack(self.read(at, _CHUNK.size))
             start = at + _CHUNK.size
-            if name in (b"RIFF", b"LIST") and self.read(start, 4) in _LISTS:
+            # traversed
+            if name in (b"RIFF", b"LIST") and self.read(start, 4) in (
+                b"AVI ",
+                b"AVIX",
+                b"hdrl",
+                b"strl",
+                b"movi",
+                b"rec ",
+            ):
                 # an interrupted program leaves the length of its lists at 0
                 self.whole = self.whole and 4 <= length <= self._size - start
                 at = start + 4
@@ -126,7 +129,8 @@ class _Walk:
                 ticks, flags = struct.unpack_from(">hB", block, begin) if has_head else (0, _LACING)
                 if flags & _LACING:
                     self.whole = False
-                elif track == number and cluster_time < _MOST_TICKS:
+                # a clock beyond that is damage
+                elif track == number and cluster_time < 2**60:
                     begin += 3
                     self.frames.extend((start + begin, length - begin, cluster_time + ticks))
 
@@ -285,8 +289,10 @@ class DepthVideo(Stack):
         self._summed = False  # whether this stream has check sums, once detected
         self._next = -1
         starts = [int.from_bytes(self._bytes(k, 2), "big") for k in range(len(self))]
-        self._keys = np.flatnonzero(np.array(starts) >= _KEY)
-        for key in self._keys[:_N_PROBED].tolist():
+        # least start value of an FFV1 key frame: its first coded bit is 1
+        self._keys = np.flatnonzero(np.array(starts) >= 0x7F80)
+        # key frames, one of which must be depth: the first may be damaged
+        for key in self._keys[:3].tolist():
             self._codec = self._fresh_codec()
             with suppress(av.FFmpegError):
                 for frame in self._codec.decode(av.Packet(self._bytes(key))):

@@ -207,7 +207,6 @@ def not_depth_error(where: str, found: str, width: int, height: int) -> Recordin
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _END = struct.pack(">I", 0) + b"IEND\xaeB`\x82"  # the last chunk: no data, its name, its CRC
 _HEAD_BYTES = 33  # signature and the whole header chunk with its CRC
-_SIZE_BYTES = 26  # part of it with size and kind
 _COLOURS = {
     0: "grey",
     2: "colour",
@@ -304,7 +303,8 @@ def png_size(head: bytes, where: str, colour: bool = False) -> Size | None:
     """
     if not head.startswith(_SIGNATURE[: len(head)]):
         raise something_else(where, "PNG")
-    if len(head) < _SIZE_BYTES:
+    # part of it with size and kind
+    if len(head) < 26:
         return None
     width, height, bits, kind = struct.unpack(">IIBB", head[16:26])
     if (
@@ -361,12 +361,12 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
     return stack
 
 
-def _pgm_header(path: Path) -> tuple[bytes, tuple[int, ...]]:
-    """The head of a file, and its width, height, largest value and bytes of the header, or ()."""
+def _pgm_header(path: Path) -> tuple[bytes, list[int]]:
+    """The head of a file, and its width, height, largest value and bytes of the header, or []."""
     with path.open("rb") as file:
         head = file.read(_PGM_HEAD_BYTES)
     match = _HEADER.match(head)
-    return head, (*map(int, match.groups()), match.end()) if match else ()
+    return head, [*map(int, match.groups()), match.end()] if match else []
 
 
 def _probe_pgm(path: Path) -> Probe:
@@ -386,9 +386,9 @@ def _probe_pgm(path: Path) -> Probe:
 
 def _decode_pgm(path: Path, dtype: str) -> NDArray[np.uint16] | None:
     _, header = _pgm_header(path)
-    if not header or too_large(header[:2]):
+    width, height, _, n_bytes = header or (0, 0, 0, 0)
+    if not header or too_large((width, height)):
         return None
-    width, height, _, n_bytes = header
     pixels = np.fromfile(path, dtype, width * height, offset=n_bytes)
     whole = pixels.size == width * height
     return pixels.astype(np.uint16).reshape(height, width) if whole else None
@@ -406,12 +406,9 @@ def _roughness(stored: NDArray[np.uint16] | None) -> float:
 # PCL's `.pclzf` images: 16-bit depth packed with LZF, intrinsics in one XML file per image.
 
 
-_MAGIC = b"PCLZF"
 _PCLZF_HEADER = struct.Struct(
     "<5sII16sII"
 )  # magic, width, height, type, bytes packed, bytes unpacked
-_DEPTH = "depth16"
-_XML_BYTES = 1 << 16
 _INTRINSICS = {  # element of <depth>: our name
     "focal_length_x": "fx",
     "focal_length_y": "fy",
@@ -436,7 +433,7 @@ def open_pclzfs(files: list[Path], progress: Progress) -> FileStack:
 def _probe_pclzf(path: Path) -> Probe:
     with path.open("rb") as file:
         head = file.read(_PCLZF_HEADER.size)
-    if not head.startswith(_MAGIC[: len(head)]):
+    if not head.startswith(b"PCLZF"[: len(head)]):
         return something_else(path, "PCLZF")
     if len(head) < _PCLZF_HEADER.size:
         return None
@@ -445,7 +442,9 @@ def _probe_pclzf(path: Path) -> Probe:
     kind = raw_kind.rstrip(b" \0").decode("ascii", "replace")
     if kind in ("rgb24", "yuv422", "bayer8"):
         raise not_depth_error(str(path), f"8-bit {kind}", width, height)
-    fits = kind == _DEPTH and not too_large((width, height)) and 0 < unpacked == 2 * width * height
+    fits = (
+        kind == "depth16" and not too_large((width, height)) and 0 < unpacked == 2 * width * height
+    )
     there = path.stat().st_size >= _PCLZF_HEADER.size + packed
     return (width, height) if fits and there else None
 
@@ -480,7 +479,7 @@ def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
     if not path.is_file():
         return None
     with path.open("rb") as file:
-        text = file.read(_XML_BYTES)
+        text = file.read(1 << 16)
     try:
         # bandit B314: expat reads no external entities and limits the others, which tests check
         root = ET.fromstring(  # nosec B314
@@ -503,17 +502,13 @@ def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
 
 _SPARE = 1 << 20  # bytes
 _LZMA = (34925,)
-_LZMA_MEMORY = 1 << 28  # bytes; the largest of its usual levels needs 64 MB
 _UNPACKERS = (8, 32946, 50013, *_LZMA)  # codes of compression: DEFLATE, LZMA
 
 # tifffile reports damage twice, as an exception and in the log; hide the
 # log
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
-_LEAST_DIRECTORY = 30  # bytes: the directory of an image has more
-_DEPTHS = ("u2", "i2", "f4")  # types of depth pixels
 _KINDS = {"u": "unsigned integer ", "i": "signed integer ", "f": "floating-point "}
-_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 
 class _Page(NamedTuple):
@@ -610,7 +605,8 @@ def _fits(packed: bytes, compression: int, most: int) -> bool:
     try:
         if compression not in _LZMA:
             return len(zlib.decompressobj().decompress(packed, most + 1)) <= most
-        unpacker = lzma.LZMADecompressor(memlimit=_LZMA_MEMORY)
+        # bytes; the largest of its usual levels needs 64 MB
+        unpacker = lzma.LZMADecompressor(memlimit=1 << 28)
         return len(unpacker.decompress(packed, most + 1)) <= most
     except lzma.LZMAError:
         return False
@@ -666,7 +662,7 @@ def _list_pages(path: Path) -> tuple[list[_Page], bool]:
     size_bytes = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(4)
-    if len(head) == 4 and head not in _SIGNATURES:
+    if len(head) == 4 and head not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         raise something_else(path, "TIFF")
     listed: list[_Page] = []
     known: set[int] = set()
@@ -674,7 +670,8 @@ def _list_pages(path: Path) -> tuple[list[_Page], bool]:
         with tifffile.TiffFile(path) as tif:
             page: Any
             for page in tif.pages:
-                if page.offset in known or len(listed) * _LEAST_DIRECTORY > size_bytes:
+                # bytes: the directory of an image has more
+                if page.offset in known or len(listed) * 30 > size_bytes:
                     return listed, False  # the list of directories is circular
                 known.add(page.offset)
                 listed.append(_describe(path, len(listed), page, size_bytes))
@@ -707,7 +704,12 @@ def _list_ends(tif: Any) -> bool:
 def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
     width, height = size = int(page.imagewidth), int(page.imagelength)
     dtype = np.dtype(page.dtype or "V1")
-    if page.samplesperpixel != 1 or dtype.str[1:] not in _DEPTHS or not (width and height):
+    # types of depth pixels
+    if (
+        page.samplesperpixel != 1
+        or dtype.str[1:] not in ("u2", "i2", "f4")
+        or not (width and height)
+    ):
         colour = "grey" if page.samplesperpixel == 1 else "colour"
         kind = "" if dtype == np.uint8 else _KINDS.get(dtype.kind, "")
         found = f"{page.bitspersample}-bit {kind}{colour}"
@@ -733,7 +735,7 @@ def _describe(path: Path, index: int, page: Any, size_bytes: int) -> _Page:
 
 def _imagej_stack(tif: Any, pages: list[_Page], size_bytes: int) -> list[_Page]:
     """The images of an ImageJ stack over 4 GB, described as one page and stored without gaps."""
-    shape = tif.series[0].shape if tif.series else ()
+    shape: tuple[int, ...] = tif.series[0].shape if tif.series else ()
     (first,) = pages
     if len(shape) < 3 or first.offset < 0:
         return pages

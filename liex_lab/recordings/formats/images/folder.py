@@ -50,8 +50,6 @@ KINDS: dict[str, tuple[str, ...]] = {  # suffixes of image files
     "PGM": (".pgm",),
     "PCLZF": (".pclzf",),
 }
-_EIGHT_BIT = (".jpg", ".jpeg", ".bmp", ".gif", ".webp")
-_COLOUR_PCLZF = "_rgb.pclzf"  # PCL's grabber writes one per depth image
 
 
 def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
@@ -71,7 +69,8 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
     chosen = [
         path
         for path in inside
-        if fnmatch(path.name, pattern) and not path.name.endswith(_COLOUR_PCLZF)
+        # PCL's grabber writes one per depth image
+        if fnmatch(path.name, pattern) and not path.name.endswith("_rgb.pclzf")
     ]
     kinds = {kind: [p for p in chosen if p.suffix.lower() in ends] for kind, ends in KINDS.items()}
     found = [
@@ -87,7 +86,9 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
             f'kind; choose with a line such as pattern = "{one}" under [camera] in camera.toml',
             one,
         )
-    eight_bit = [path for path in chosen if path.suffix.lower() in _EIGHT_BIT]
+    eight_bit = [
+        path for path in chosen if path.suffix.lower() in (".jpg", ".jpeg", ".bmp", ".gif", ".webp")
+    ]
     if not found and eight_bit:
         raise RecordingError(
             "expected 16-bit depth pictures (PNG or TIFF), got 8-bit pictures such as "

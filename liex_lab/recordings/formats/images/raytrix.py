@@ -50,8 +50,6 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_toml
 
 PROFILE_FILE = "raytrix.toml"
-_SHIPPED = Path(__file__).with_name("raytrix_profiles.toml")
-_CONFIRMED = "confirmed"  # start of evidence that needs no warning
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -117,7 +115,8 @@ class Profile(BaseModel):
     @property
     def doubt(self) -> str | None:
         """A sentence for an unconfirmed profile; None if it is confirmed."""
-        if self.evidence.lower().startswith(_CONFIRMED):
+        # start of evidence that needs no warning
+        if self.evidence.lower().startswith("confirmed"):
             return None
         return (
             f"depth is read through the profile {self.name!r}, which is not confirmed "
@@ -183,7 +182,7 @@ class Profile(BaseModel):
 
 def shipped_profiles() -> dict[str, dict[str, Any]]:
     """The profiles included in the package, by name."""
-    return read_toml(_SHIPPED)
+    return read_toml(Path(__file__).with_name("raytrix_profiles.toml"))
 
 
 def read_profile(path: Path) -> Profile:
@@ -229,7 +228,6 @@ def read_profile(path: Path) -> Profile:
         raise RecordingError(f"{path}: {f'{key} {why}' if key else why}") from None
 
 
-_LOOKS_LIKE = ("*depthmap*.*", "*depth3d*.*", "*.xyz", "*.ply")  # names of exports
 _NO_SCALE = (
     " (the Raytrix calibration in it holds the micro-lens grid in virtual depth, but no focal "
     "length and no metric scale)"
@@ -296,9 +294,12 @@ def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
         folder: their folder.
         names: names of the files in it.
     """
-    return any(fnmatch(name.lower(), pattern) for name in names for pattern in _LOOKS_LIKE) or any(
-        _is_calibration(folder / name) for name in names if name.lower().endswith(".xml")
-    )
+    # names of exports
+    return any(
+        fnmatch(name.lower(), pattern)
+        for name in names
+        for pattern in ("*depthmap*.*", "*depth3d*.*", "*.xyz", "*.ply")
+    ) or any(_is_calibration(folder / name) for name in names if name.lower().endswith(".xml"))
 
 
 def _is_calibration(path: Path) -> bool:
@@ -487,7 +488,7 @@ class _PlyHeader(NamedTuple):
 
     def is_cut(self, path: Path) -> bool:
         """Whether the file is too short for the vertices; a number takes two bytes of text."""
-        row_bytes = 2 * len(self.row) if self.is_text else self.row.itemsize
+        row_bytes = 2 * len(self.row.names or ()) if self.is_text else self.row.itemsize
         return path.stat().st_size + self.is_text < self.start + self.n * row_bytes
 
 
@@ -497,7 +498,8 @@ def _ply_header(head: bytes) -> _PlyHeader | None:
     start = head.find(b"\n", end) + 1
     if end < 0 or not start:
         return None
-    order = element = None
+    order: str | None = None
+    element = ""
     n = -1
     fields: dict[str, str] = {}
     for line in head[:end].decode("latin-1").splitlines():

@@ -67,10 +67,8 @@ _EXPECTED = (
 )
 _LIMIT_NS = 2**62  # the year 2116
 _DAMAGE = (ValueError, TypeError, KeyError, OverflowError, struct.error, DamagedChunk)
-_FACTS = ("subject_id", "session_start_time")
 # most calibrations compared per topic: different ones, and those listed by an index
 _N_COMPARED = 12
-_SAME_CAMERA = 0.005  # of the focal length or the image: a driver's rounding
 _STATE_IT = (
     "state the depth camera's numbers with --set camera.fx=... --set camera.fy=... --set "
     "camera.cx=... --set camera.cy=..."
@@ -317,7 +315,11 @@ def _open(
     packed = PackFacts.of(file.notes)
     problems += packed.problems
     start = start_of_clock(int(monotone.times_ns[0])) or found.stated.start(chosen.name)
-    stated = {name: file.notes[name] for name in _FACTS if name in file.notes}
+    stated = {
+        name: file.notes[name]
+        for name in ("subject_id", "session_start_time")
+        if name in file.notes
+    }
     metadata = ({"session_start_time": start} if start else {}) | stated | camera_file.metadata
     stated_mm = found.stated.step_mm(chosen.name, camera_file.states_unit, problems, doubts)
     step_mm = (stated_mm or 1.0) * packed.step_mm
@@ -565,7 +567,8 @@ def _calibrated(
         scales = (*numbers[:2], *size)
         by = max(abs(a - b) / scale for a, b, scale in zip(later, numbers, scales, strict=True))
         if by > 0.0:
-            (doubts if by > _SAME_CAMERA else problems).append(
+            # of the focal length or the image: a driver's rounding
+            (doubts if by > 0.005 else problems).append(
                 f"{here} changes {(later_ns - first_ns) * 1e-9:.2f} s after its first: fx, fy, cx, "
                 f"cy from {', '.join(f'{n:g}' for n in numbers)} to "
                 f"{', '.join(f'{n:g}' for n in later)}; the first is used, and lengths are wrong "

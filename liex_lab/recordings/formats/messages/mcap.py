@@ -62,10 +62,8 @@ _FOOTER = struct.Struct(
 _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
-_BLOCK = 1 << 20
 # chunks of at most this size are unpacked ahead
 THREADS = 2
-_SMALL_CHUNK = 1 << 23
 FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 _SUMMARY = (*FACTS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX, Opcode.STATISTICS)
 LARGEST_FACT = 1 << 24  # bytes of one such record
@@ -239,7 +237,7 @@ class McapFile(MessageFile):
                 chunk = self._chunk(start, end - start)
             except (DamagedChunk, struct.error, UnicodeDecodeError):
                 return  # the walk reports it later
-            if chunk.size <= _SMALL_CHUNK:
+            if chunk.size <= (1 << 23):
                 self.file.seek(chunk.offset)
                 self._coming[start] = unpackers.submit(
                     unpacked, self.file.read(chunk.length), chunk
@@ -282,7 +280,7 @@ class McapFile(MessageFile):
         """CRC-32 of the bytes from start to end, computed in blocks."""
         self.file.seek(start)
         crc = 0
-        while start < end and (block := self.file.read(min(_BLOCK, end - start))):
+        while start < end and (block := self.file.read(min((1 << 20), end - start))):
             crc = zlib.crc32(block, crc)
             start = start + len(block)
         return crc
@@ -372,8 +370,6 @@ class McapFile(MessageFile):
 
 
 _UNKNOWN = -1  # the length of a message is only stated in its chunk
-_LARGEST_INDEX = 1 << 26  # bytes of one
-_LARGEST_OFFSET = 1 << 40
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
 _ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 _HEAD = 512  # first bytes of a message's record, with its stamp
@@ -420,7 +416,8 @@ class IndexedMcap(McapFile):
             self.chunks.append(self._chunk(start, end - start))
             offsets = index.message_index_offsets
             first = min(offsets.values(), default=0)
-            if not 0 <= index.message_index_length <= min(_LARGEST_INDEX, self.size):
+            # bytes of one
+            if not 0 <= index.message_index_length <= min((1 << 26), self.size):
                 raise DamagedChunk("an index is larger than its file")
             self.file.seek(first)
             content = self.file.read(index.message_index_length)
@@ -575,7 +572,7 @@ def _listed(channel: Channel, tables: Sequence[_Table]) -> Listed:
     counts = [len(entries) // _ENTRY.itemsize for _, entries in tables]
     number = np.repeat(np.array([number for number, _ in tables], np.int64), counts)
     order = np.lexsort((table["offset"], number))
-    order = order[table["offset"][order] <= _LARGEST_OFFSET]
+    order = order[table["offset"][order] <= (1 << 40)]
     places = np.full((len(order), 3), _UNKNOWN, np.int64)
     places[:, 0] = number[order]
     places[:, 1] = table["offset"][order]

@@ -100,7 +100,6 @@ def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
 _FIELD_TYPES = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
 _SECOND = 10**9
 _STAMP = 1 << 3 | 2  # protobuf's key of field 1, the stamp, length-delimited
-_ONE_BYTE = 127  # the largest length in one byte
 _NO_JSON = (ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 
 
@@ -176,7 +175,8 @@ def stamp_in(head: memoryview) -> int | None:
     Returns:
         The stamp; None if another field is first, as in a message without a stamp.
     """
-    if len(head) < 2 or head[0] != _STAMP or head[1] > min(_ONE_BYTE, len(head) - 2):
+    # the largest length in one byte
+    if len(head) < 2 or head[0] != _STAMP or head[1] > min(127, len(head) - 2):
         return None
     try:
         stamp = Timestamp.FromString(bytes(head[2 : 2 + head[1]]))
@@ -190,9 +190,7 @@ def stamp_in(head: memoryview) -> int | None:
 
 # sensor_msgs/PointField: number of a type, and NumPy's name of it without the byte order
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_MOST_FIELDS = 256
 _SECOND_VERSION = 4  # largest alignment of its numbers, bytes
-_PLAIN_CDR = (b"\0\0", b"\0\1", b"\0\6", b"\0\7")  # big and little endian, version 1 and 2
 
 
 class _Fields:
@@ -260,7 +258,8 @@ class _CdrFields(_Fields):
     def __init__(self, data: memoryview) -> None:
         super().__init__(data)
         kind = bytes(data[:2])
-        if len(data) < 4 or kind not in _PLAIN_CDR:
+        # big and little endian, version 1 and 2
+        if len(data) < 4 or kind not in (b"\0\0", b"\0\1", b"\0\6", b"\0\7"):
             raise DamagedMessage(
                 f"a message begins with {kind.hex(' ')}, which is no plain CDR (00 00, 00 01, 00 "
                 "06 or 00 07)"
@@ -305,7 +304,7 @@ def _point_cloud2(fields: _Fields) -> PointCloud:
     if fields.largest_step == _SECOND_VERSION:  # the list's length in bytes
         fields.whole()
     n_fields = fields.whole()
-    if n_fields > _MOST_FIELDS:
+    if n_fields > 256:
         raise DamagedMessage(f"a cloud's points have {n_fields} fields")
     found = []
     for _ in range(n_fields):
@@ -373,7 +372,6 @@ def _header_stamp(layout: type[_Fields], head: memoryview) -> int | None:
 LARGEST_PICTURE = (
     1 << 24
 )  # pixels; more than any depth camera: a damaged size would need all the memory
-_LARGEST_CLOUD = 1 << 22  # points
 _METRE = 1000.0
 _ENCODINGS = {
     "16UC1": ("u2", 1.0),
@@ -384,7 +382,6 @@ _CONFIG = struct.Struct(
     "<iff"
 )  # precedes a compressedDepth image: format, and a and b of quantised depth
 _RVL_SIZE = struct.Struct("<II")
-_PNG_HEAD = 26
 
 
 def picture_size(message: DepthMessage) -> tuple[int, int] | None:
@@ -399,7 +396,8 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     """
     if isinstance(message, PointCloud):
         n = message.width * message.height
-        known = {"x", "y", "z"} <= message.columns.keys() and 0 < n <= _LARGEST_CLOUD
+        # points
+        known = {"x", "y", "z"} <= message.columns.keys() and 0 < n <= (1 << 22)
         size = (message.width, message.height) if message.height > 1 else (0, 0)
         return size if known else None
     if isinstance(message, RawPicture):
@@ -409,11 +407,7 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     else:
         is_rvl, body = _unwrapped(message)
         try:
-            found = (
-                _RVL_SIZE.unpack_from(body)
-                if is_rvl
-                else png_size(bytes(body[:_PNG_HEAD]), "picture")
-            )
+            found = _RVL_SIZE.unpack_from(body) if is_rvl else png_size(bytes(body[:26]), "picture")
         except (RecordingError, struct.error):
             return None  # a colour PNG is not depth
     fits = found is not None and min(found) > 0 and found[0] * found[1] <= LARGEST_PICTURE

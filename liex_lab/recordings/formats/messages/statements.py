@@ -33,7 +33,6 @@ from liex_lab.recordings.formats.messages.messages import (
 from liex_lab.recordings.timestamps import FAULTS, LIMIT_NS, start_of_clock
 
 _OF_PROGRAM = re.compile(r"^/device_\d+/sensor_\d+/")
-_ROUNDING_MM = 1e-3  # units are written with six decimals of a metre
 _LENS = ("width", "height", "fx", "ppx", "fy", "ppy")
 
 
@@ -124,7 +123,8 @@ class Statements:
                 "in camera.toml if it differs"
             )
         every = sorted({unit for units in stated.values() for unit in units})
-        differ = bool(every) and every[-1] - every[0] > _ROUNDING_MM
+        # units are written with six decimals of a metre
+        differ = bool(every) and every[-1] - every[0] > 1e-3
         if not every or (differ and settled):
             return None
         step_mm, _ = stated[max(stated, key=len)].most_common(1)[0]
