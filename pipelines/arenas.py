@@ -26,7 +26,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import unwritable_times
 from liex_lab.runtime.places import inside
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene.region import Corners, masks_apart
+from liex_lab.scene.zones import Corners, masks_apart
 
 from .build import build_recording
 from .choice import USUAL, fit_plan

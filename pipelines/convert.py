@@ -39,7 +39,7 @@ from .build import build_recording, build_tracker, open_planned
 
 if TYPE_CHECKING:
     from liex_lab.recordings.frame import Depth
-    from liex_lab.scene.region import Corners
+    from liex_lab.scene.zones import Corners
     from liex_lab.tracking.tracker import FrameTracker
 
 

@@ -42,9 +42,8 @@ from liex_lab.recordings.timestamps import (
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_toml
 from liex_lab.scene.background import has_noise, sample_frames, sampled, stride_for
-from liex_lab.scene.outline import Arena
-from liex_lab.scene.region import masks_apart
-from liex_lab.scene.scene import Fixture
+from liex_lab.scene.scene import Arena, Fixture
+from liex_lab.scene.zones import masks_apart
 from liex_lab.sessions.folder import megabytes
 from liex_lab.tracking.offline import copies_told
 

@@ -20,11 +20,11 @@ from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.floor import Floor, floor_patch
-from liex_lab.scene.outline import find_arena
-from liex_lab.scene.support_plane import SampledScene, find_support_plane
+from liex_lab.scene.scene import find_arena
+from liex_lab.scene.support_plane import find_support_plane
 
 from .origin import animal_of, build_zones
-from .regions import region_of, stated_floor
+from .regions import region_of, stated_floor, target_of
 
 if TYPE_CHECKING:
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
@@ -77,7 +77,7 @@ class SceneLook:
 
     def at_scene(self) -> None:
         """Inspect floor, noise, arena, water and animal; fills facts and problems."""
-        from liex_lab.scene.background import learn_background
+        from liex_lab.scene.background import SampledScene
 
         grid = self.seen.camera.every(self.stride)
         try:
@@ -90,23 +90,11 @@ class SceneLook:
             self._region = region[:: self.stride, :: self.stride]
             self.sample = self.sample * self._region
         self._floor = stated
-        background, spread, _ = learn_background(self.sample)
-        animal = animal_of(self.plan)
+        scene = SampledScene.learn(self.sample, grid, target_of(self.plan))
+        background = scene.background
         try:
-            scene = SampledScene(
-                self.sample,
-                background,
-                spread,
-                grid,
-                (animal.spine_min_mm, animal.spine_max_mm),
-                self.plan.foreground.min_height_mm,
-                Skeleton.load(animal.skeleton).view,
-            )
             support_plane = find_support_plane(
-                scene,
-                None
-                if stated is None
-                else Floor.from_plane(stated.normal, stated.distance_mm, grid),
+                scene, None if stated is None else stated.for_camera(grid)
             )
         except EstimationError as error:
             self.problems.append(f"no floor: {error}")
@@ -128,7 +116,7 @@ class SceneLook:
             for zone in build_zones(self.plan):
                 zone.placed(
                     self.seen.camera,
-                    Floor.from_plane(floor.normal, floor.distance_mm, self.seen.camera),
+                    floor.for_camera(self.seen.camera),
                     arena,
                 )
         except PlanError as error:

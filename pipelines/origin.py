@@ -11,13 +11,12 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from liex_lab.behaviour.places import Surroundings
+    from liex_lab.behaviour.activity import Surroundings
     from liex_lab.plan import Plan
     from liex_lab.plan.sections import AnimalSettings
     from liex_lab.recordings.recording import Recording
     from liex_lab.scene.height_maps import Segmenter
-    from liex_lab.scene.outline import Arena
-    from liex_lab.scene.scene import Scene
+    from liex_lab.scene.scene import Arena, Scene
     from liex_lab.scene.zones import DrawnZone, Zone
     from liex_lab.sessions import Provenance
     from liex_lab.tracking.tracker import FrameTracker
@@ -132,13 +131,11 @@ def build_arena(scene: Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
         plan: names the file of zones.
     """
     from liex_lab.scene.background_segmenter import BackgroundSubtraction
-    from liex_lab.scene.floor import Floor
-    from liex_lab.scene.outline import UNKNOWN, find_arena
+    from liex_lab.scene.scene import UNKNOWN, find_arena
 
     arena = UNKNOWN
     if isinstance(scene, BackgroundSubtraction):
-        floor = Floor.from_plane(scene.floor.normal, scene.floor.distance_mm, scene.grid)
-        arena = find_arena(scene.background, floor, scene.grid)
+        arena = find_arena(scene.background, scene.floor.for_camera(scene.grid), scene.grid)
     return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
 
 
@@ -155,7 +152,7 @@ def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
 
 def build_surroundings(provenance: Provenance) -> Surroundings:
     """Arena, zones and water surface for the measures of behaviour."""
-    from liex_lab.behaviour.places import Surroundings, surface_height_mm
+    from liex_lab.behaviour.activity import Surroundings, surface_height_mm
 
     surface = surface_height_mm(provenance.floor_distance_mm, provenance.optics)
     return Surroundings(provenance.arena, [zone.name for zone in provenance.zones], surface)

@@ -34,7 +34,7 @@ from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.text_files import decoded, parse_toml, read_toml
 from liex_lab.scene.background import sample_frames, usual_depth
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.region import region_corners_px
+from liex_lab.scene.zones import region_corners_px
 from liex_lab.sessions import Session
 from liex_lab.sessions.evidence import linked_recording
 

@@ -18,16 +18,17 @@ from liex_lab.plan.sections import Region, SeveralArenas
 from liex_lab.recordings.frame import region_mask
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.multi_arena import arenas_apart
-from liex_lab.scene.region import Corners, region_corners_px
 from liex_lab.scene.scene import plane_of
-from liex_lab.scene.support_plane import SampledScene, find_support_plane
+from liex_lab.scene.support_plane import arenas_apart, find_support_plane
+from liex_lab.scene.zones import Corners, region_corners_px
 
 from .origin import animal_of
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from liex_lab.scene.background import SampledScene, TargetAnimal
 
 
 _N_SAMPLED = 96
@@ -93,27 +94,28 @@ def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
     if stated is not None:
         return stated
     found = find_support_plane(_sampled(recording, plan)[0]).floor
-    return Floor.from_plane(found.normal, found.distance_mm, recording.camera)
+    return found.for_camera(recording.camera)
 
 
 def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
     """Frames spread over a recording with their background, and the stride of their pixels."""
-    from liex_lab.scene.background import learn_background, sample_frames, stride_for
+    from liex_lab.scene.background import SampledScene, sample_frames, stride_for
+
+    stride = stride_for(recording, animal_of(plan).spine_min_mm)
+    sample = sample_frames(recording, _N_SAMPLED, stride)
+    return SampledScene.learn(sample, recording.camera.every(stride), target_of(plan)), stride
+
+
+def target_of(plan: Plan) -> TargetAnimal:
+    """The animal of a plan as it is searched for in depth images."""
+    from liex_lab.scene.background import TargetAnimal
 
     animal = animal_of(plan)
-    stride = stride_for(recording, animal.spine_min_mm)
-    sample = sample_frames(recording, _N_SAMPLED, stride)
-    background, spread, _ = learn_background(sample)
-    scene = SampledScene(
-        sample,
-        background,
-        spread,
-        recording.camera.every(stride),
+    return TargetAnimal(
         (animal.spine_min_mm, animal.spine_max_mm),
         plan.foreground.min_height_mm,
         Skeleton.load(animal.skeleton).view,
     )
-    return scene, stride
 
 
 def arenas_of(recording: Recording, plan: Plan) -> list[SeveralArenas]:

@@ -482,7 +482,7 @@ def name_actions(
         they contradict their definition.
     """
     from liex_lab.actions.vocabulary import printed_meanings
-    from liex_lab.behaviour.measures import recognise
+    from liex_lab.behaviour.bouts import recognise
     from liex_lab.tables.rows import bout_rows
 
     found = recognise(recogniser, rows.track, rows.wall_distance_mm, moved, allocate)

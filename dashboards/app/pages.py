@@ -18,7 +18,7 @@ from flask import Flask, Response, jsonify, redirect, render_template, request
 from markupsafe import Markup
 from werkzeug.exceptions import NotFound
 
-from liex_lab.actions.vocabulary import PALETTE, UNLABELLED
+from liex_lab.actions.vocabulary import PALETTE, UNLABELLED_COLOUR
 from liex_lab.behaviour import cohort
 from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import LiexError, SessionError
@@ -260,7 +260,7 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
     ones = data.ethograms(chosen_keys(data, names, chosen))
     words = shown_words(ones.values())
     coloured = colours_of(words[: len(PALETTE)], vocabulary_of(ones.values()))
-    colours = {**coloured, "unlabelled": UNLABELLED, NO_POSE: NO_POSE_COLOUR}
+    colours = {**coloured, "unlabelled": UNLABELLED_COLOUR, NO_POSE: NO_POSE_COLOUR}
     if len(words) > len(PALETTE):
         colours[OTHER] = GREY
     start_s, stop_s = _span(max((one.duration_s for one in ones.values()), default=0.0))

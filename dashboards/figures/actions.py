@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from liex_lab.actions.vocabulary import UNLABELLED, action_colours
+from liex_lab.actions.vocabulary import UNLABELLED_COLOUR, action_colours
 from liex_lab.behaviour.activity import Around, around_onsets
 
 from ..units import counted, shown
@@ -46,7 +46,7 @@ _BESIDE = 4  # panels per row
 def time_budget(seen: Seen) -> Figure | None:
     """Share of the observed time in each action and unlabelled; None without actions."""
     row = seen.summary
-    colours = {**action_colours(seen.words), "unlabelled": UNLABELLED}
+    colours = {**action_colours(seen.words), "unlabelled": UNLABELLED_COLOUR}
     words = [word for word in colours if row is not None and f"{word}_share" in row]
     if row is None or not words or not np.isfinite([row[f"{word}_share"] for word in words]).any():
         return None
@@ -95,7 +95,7 @@ def activity(seen: Seen) -> Figure | None:
     spent = {word: table[f"{word}_s"].to_numpy(float) for word in words}
     total = np.maximum(observed, np.sum([*spent.values()], axis=0))
     spent["unlabelled"] = total - np.sum([*spent.values()], axis=0)
-    colours["unlabelled"] = UNLABELLED
+    colours["unlabelled"] = UNLABELLED_COLOUR
     seen_words = [word for word, seconds in spent.items() if seconds.sum() > 1e-6]
     low = 9.0 + 4.0 * key_rows(seen_words)
     figure = sheet(TWO_COLUMNS_MM, low + 31.0)

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 
 from liex_lab.actions.vocabulary import action_colours
+from liex_lab.behaviour.activity import Occupancy, occupancy
 from liex_lab.behaviour.cohort import counted_units
-from liex_lab.behaviour.places import Occupancy, occupancy
 from liex_lab.behaviour.statistics import animal_means
 from liex_lab.plan.subject import references_first
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.behaviour.activity import Occupancy, occupancy
 from liex_lab.behaviour.body import BRANCHES, axis_of
-from liex_lab.behaviour.places import Occupancy, occupancy
 from liex_lab.scene.scene import Fixture
 from liex_lab.sessions import Session
 

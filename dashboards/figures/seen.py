@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.places import hold_times
+from liex_lab.behaviour.activity import hold_times
 from liex_lab.sessions import Session
 from liex_lab.sessions.cutouts import meant_to_keep_depth
 

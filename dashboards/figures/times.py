@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import PREDICTED_ERROR, action_colours
-from liex_lab.behaviour.body import Curve, curves_of
+from liex_lab.behaviour.body import DrawnMeasure, drawn_measures
 
 from ..units import counted, shown
 from .seen import Array, Seen
@@ -45,12 +45,12 @@ _HAIR_MM = 0.05  # bouts with a smaller distance are one bar
 Span = tuple[float, float]
 
 
-def drawn_curves(seen: Seen) -> list[Curve]:
+def drawn_curves(seen: Seen) -> list[DrawnMeasure]:
     """The curves of the animal that its session contains."""
     moved = seen.kinematics
     if moved is None:
         return []
-    return [one for one in curves_of(seen.session.metadata["animal"]) if one.column in moved]
+    return [one for one in drawn_measures(seen.session.metadata["animal"]) if one.column in moved]
 
 
 def ethogram(seen: Seen, span_s: Span | None = None) -> Figure | None:
@@ -198,7 +198,7 @@ def speed_distribution(seen: Seen) -> Figure | None:
 
 def error_distribution(seen: Seen) -> Figure | None:
     """Share of the observed time at each predicted error; None if unknown."""
-    from liex_lab.behaviour.places import hold_times
+    from liex_lab.behaviour.activity import hold_times
 
     values = seen.frames["predicted_error_mm"].to_numpy(float)
     hold = hold_times(seen.frames["time_s"].to_numpy(float))

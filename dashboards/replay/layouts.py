@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.behaviour.body import Curve, curves_of
+from liex_lab.behaviour.body import DrawnMeasure, drawn_measures
 from liex_lab.runtime.durable import replacing
 from liex_lab.sessions import Session
 
@@ -109,7 +109,7 @@ def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, A
     lanes = rrb.StateTimelineView(
         origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
     )
-    shown = curves_of(animal)
+    shown = drawn_measures(animal)
     curves = rrb.Horizontal(
         *(
             rrb.TimeSeriesView(
@@ -130,7 +130,7 @@ def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, A
     return lanes, curves
 
 
-def _called(curve: Curve) -> str:
+def _called(curve: DrawnMeasure) -> str:
     """Name of a curve's view."""
     return f"{curve.title.lower()} {curve.what}".split(";")[0].split(",")[0]
 

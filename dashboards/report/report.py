@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
-from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED, action_colours
+from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED_COLOUR, action_colours
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import found_video
@@ -219,7 +219,7 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
         return []
     row = session.summary.iloc[0]
     rows = []
-    for word, colour in (*action_colours(words).items(), ("unlabelled", UNLABELLED)):
+    for word, colour in (*action_colours(words).items(), ("unlabelled", UNLABELLED_COLOUR)):
         if f"{word}_s" in row:  # sessions of an older version lack some of the others
             values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
             texts = [

@@ -108,30 +108,14 @@ def segments_of(
     # animal and the prediction of errors but not on actions
     usual_mm = float(np.median(np.nan_to_num(track.predicted_error_mm[good], nan=0.0))) or 1.0
     wall = np.full(len(time_s), np.nan) if wall_mm is None else wall_mm
-    cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * _usual_step(time_s))) + 1
-    return [
-        _stretch(
-            track,
-            rows,
-            time_s,
-            wall,
-            (length_mm, usual_mm),
-            _clock(time_s[rows], rate_hz),
-            allocate,
-        )
-        for rows in np.split(good, cuts)
-    ]
-
-
-def _usual_step(time_s: Array) -> float:
-    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
-
-
-def _clock(time_s: Array, rate_hz: float) -> Array:
-    """(m,) s from the first to the last of these times, in steps of 1 / `rate_hz`."""
-    return (
-        time_s[0] + np.arange(max(2, int((time_s[-1] - time_s[0]) * rate_hz + 1e-6) + 1)) / rate_hz
-    )
+    step = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    cuts = np.flatnonzero(np.diff(time_s[good]) > max(LONGEST_GAP_S, 2.5 * step)) + 1
+    found = []
+    for rows in np.split(good, cuts):
+        ticks = int((time_s[rows[-1]] - time_s[rows[0]]) * rate_hz + 1e-6) + 1
+        clock = time_s[rows[0]] + np.arange(max(2, ticks)) / rate_hz
+        found.append(_stretch(track, rows, time_s, wall, (length_mm, usual_mm), clock, allocate))
+    return found
 
 
 def _stands(skeleton: Skeleton) -> bool:
@@ -328,7 +312,10 @@ def _channels(
     if skeleton.axes[1:, 1].any():
         pitch = np.stack([angles[:, group, 1].sum(axis=1) for group in groups], axis=1)
         columns += [pitch, _rate(_softened(pitch), step)]
-    columns.append(_twist(joints, length_mm, step))
+    own = (joints - joints.mean(axis=1, keepdims=True)) / length_mm
+    twist = _rate(_softened(own.reshape(len(own), -1)), step)
+    # mean speed of the joints relative to the body's middle
+    columns.append(np.sqrt((twist**2).mean(axis=1) * 3.0))
     if _stands(skeleton):
         z = joints[..., 2] / length_mm
         columns += [z[:, -1], z.mean(axis=1), z[:, 0], z[:, -1] - z[:, 0]]
@@ -337,14 +324,6 @@ def _channels(
         np.log1p(_DOUBT * error / usual_mm),
     ]
     return np.concatenate([c[:, None] if c.ndim == 1 else c for c in columns], axis=1)
-
-
-def _twist(joints: Array, length_mm: float, step: float) -> Array:
-    """(m,) lengths per second: mean speed of the joints relative to the body's middle."""
-    own = (joints - joints.mean(axis=1, keepdims=True)) / length_mm
-    return np.asarray(
-        np.sqrt((_rate(_softened(own.reshape(len(own), -1)), step) ** 2).mean(axis=1) * 3.0)
-    )
 
 
 def _softened(rows: Array) -> Array:

@@ -103,12 +103,9 @@ class Ethogram:
         Returns:
             (n,) words, `UNLABELLED` outside all bouts.
         """
-        longest = max((len(bout.action) for bout in self.bouts), default=1)
-        out = np.full(len(times_ns), UNLABELLED, dtype=f"<U{max(longest, 1)}")
-        for bout in self.bouts:
-            start, stop = np.searchsorted(times_ns, [bout.start_ns, bout.stop_ns])
-            out[start:stop] = bout.action
-        return out
+        ends = np.array([(bout.start_ns, bout.stop_ns) for bout in self.bouts], np.int64)
+        actions = [bout.action for bout in self.bouts]
+        return frame_words(actions, np.searchsorted(times_ns, ends.reshape(-1, 2)), len(times_ns))
 
     @staticmethod
     def of_words(
@@ -151,6 +148,14 @@ class Ethogram:
             if word != UNLABELLED
         ]
         return Ethogram(tuple(bouts), vocabulary or {}, source)
+
+
+def frame_words(actions: Sequence[str], spans: NDArray[np.int64], n: int) -> NDArray[np.str_]:
+    """The words (n,) of frames by bouts in rows [start, stop), `spans` (k, 2); later ones win."""
+    out = np.full(n, UNLABELLED, dtype=f"<U{max([1, *map(len, actions)])}")
+    for action, (start, stop) in zip(actions, spans, strict=True):
+        out[start:stop] = action
+    return out
 
 
 def frame_stops(times_ns: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -15,10 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED, runs_of
-from liex_lab.actions.labels import LabelledTrack
-from liex_lab.actions.scores import timeline_scores
-from liex_lab.actions.semi_markov import SemiMarkovModel
-from liex_lab.actions.timeline import Examples, Recognised, TimelineModel, clock_of, gather
+from liex_lab.actions.labels import LabelledTrack, timeline_scores
+from liex_lab.actions.timeline import (
+    CLOCK_HZ,
+    CLOCKS_HZ,
+    Examples,
+    Recognised,
+    SemiMarkovModel,
+    TimelineModel,
+    gather,
+)
 from liex_lab.errors import LiexError
 from liex_lab.mlp import LIMIT, Network, descend
 from liex_lab.runtime.progress import Progress, silent
@@ -69,17 +75,18 @@ def learn(
         LiexError: the labels name too few actions, see `vocabulary_of`.
     """
     words = vocabulary_of([*tracks, *sequences])
-    clock_hz = clock_of(tracks[0].track.skeleton)
+    skeleton = tracks[0].track.skeleton.name
+    clock_hz = CLOCKS_HZ.get(skeleton, CLOCK_HZ)
     progress(0, 3, "features of the labelled recordings")
     examples = gather([*tracks, *sequences], words, clock_hz)
-    progress(1, 3, "learning what each action looks like")
+    progress(1, 3, "training the networks")
     networks = tuple(train_network(examples, len(words), seed + k) for k in range(_MEMBERS))
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
     speeds = speeds_of(examples, len(words))
     peaks = peaks_of(examples, len(words))
     chain = SemiMarkovModel.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
-        tracks[0].track.skeleton.name,
+        skeleton,
         clock_hz,
         words,
         share,
@@ -172,7 +179,7 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     batch = int(np.clip(len(code) // 8, 1, _BATCH))
     epochs = max(_EPOCHS, min(_MOST_EPOCHS, _LEAST_STEPS * batch // len(code)))
     present = np.unique(code)  # of the vocabulary; unlabelled stretches may be missing
-    (first, (weights, bias)) = descend(
+    first, (weights, bias) = descend(
         inputs,
         code,
         (_HIDDEN,),
@@ -187,13 +194,11 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
         weights = np.hstack([0 * weights, weights])
         bias = np.hstack([0 * bias, bias])
     last = np.zeros((_HIDDEN, n_words)), np.full(n_words, _NEVER)
-    last[0][:, present] = weights
-    last[1][present] = bias
-    layers = first, last
+    last[0][:, present], last[1][present] = weights, bias
     return Network(
         centre.astype(np.float32),
         scale.astype(np.float32),
-        tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in layers),
+        tuple((w.astype(np.float32), b.astype(np.float32)) for w, b in (first, last)),
     )
 
 

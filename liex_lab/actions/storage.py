@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from liex_lab.actions.ethogram import UNLABELLED
-from liex_lab.actions.semi_markov import SemiMarkovModel
-from liex_lab.actions.timeline import TimelineModel
+from liex_lab.actions.timeline import SemiMarkovModel, TimelineModel
 from liex_lab.catalog import MODELS, sha256
 from liex_lab.errors import ModelError
 from liex_lab.mlp import Network, check_layers

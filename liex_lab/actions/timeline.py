@@ -6,7 +6,7 @@
 3. An ensemble of small networks gives p(word | tick); scores = sharpness (log p - log prior), a
    scaled likelihood (hybrid of network and Markov model, Bourlard and Morgan 1994).
 4. A semi-Markov model of durations and transitions is decoded by Viterbi, with posteriors by
-   forward-backward (`semi_markov`).
+   forward-backward (`SemiMarkovModel`).
 
 This method is our own; the recogniser of Lie-X section 4.3 names cut-out sequences only
 (`recogniser`).
@@ -17,23 +17,137 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.actions import _semi_markov_kernels as kernels
 from liex_lab.actions.channels import Segment, channel_names, segments_of, window_features
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
-from liex_lab.actions.semi_markov import SemiMarkovModel
 from liex_lab.actions.vocabulary import FASTEST
-from liex_lab.body.skeleton import Skeleton
 from liex_lab.mlp import Network
 from liex_lab.recordings.timestamps import median_step
 from liex_lab.runtime.memory import Allocator, blocks
+from liex_lab.runtime.shapes import check_shapes
 from liex_lab.tracking.track import Track
 
+Array = NDArray[np.float64]
+
+_SHORT = 0.08  # quantile of an action's lengths that counts as the shortest
+_DECODED_PIECE = 8192  # ticks per block of probabilities ...
+_MARGIN = 512  # ... and its margin on either side
+
+
+# The hidden semi-Markov model. A bout of action k lasts d_k + Geometric ticks: at least the
+# shortest usual length (8 % quantile of the labelled bouts), on average the mean length; then
+# action j follows with probability follow[k, j], estimated with half a pseudo-count. Decoding is by
+# Viterbi, posteriors by forward-backward over expanded states (`_semi_markov_kernels`; Yu 2010).
+
+
+@dataclass(frozen=True)
+class SemiMarkovModel:
+    """Durations and transitions of K actions.
+
+    Attributes:
+        shortest_s: (K,) shortest duration, s.
+        mean_s: (K,) mean duration, s.
+        follow: (K, K) probability that one follows another, 0 on the diagonal, rows sum to 1.
+    """
+
+    shortest_s: Array
+    mean_s: Array
+    follow: Array
+
+    @staticmethod
+    def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> SemiMarkovModel:
+        """The model of labelled bouts; words without bouts get default durations (0.1 s and 0.5 s).
+
+        Args:
+            runs: for each recording, the bouts (word, length in s) in order.
+            n_words: size K of the vocabulary, at least 2.
+        """
+        lengths: list[list[float]] = [[] for _ in range(n_words)]
+        counts = np.full((n_words, n_words), 0.5)
+        for run in runs:
+            for word, length in run:
+                lengths[word].append(length)
+            for (before, _), (after, _) in pairwise(run):
+                counts[before, after] += 1.0
+        np.fill_diagonal(counts, 0.0)
+        shortest = np.array([np.quantile(some, _SHORT) if some else 0.1 for some in lengths])
+        mean = np.array([np.mean(some) if some else 0.5 for some in lengths])
+        return SemiMarkovModel(
+            shortest, np.maximum(mean, shortest), counts / counts.sum(axis=1, keepdims=True)
+        )
+
+    def _terms(self, step_s: float) -> tuple[NDArray[np.int64], Array, Array, Array]:
+        """The kernels' `first`, `stay`, `leave` and `switch` on a clock with this step."""
+        least = np.maximum(np.round(self.shortest_s / step_s).astype(np.int64), 1)
+        more = np.maximum(
+            self.mean_s / step_s - least, 0.5
+        )  # ticks spent in the last state beyond the first
+        go = more / (1.0 + more)
+        with np.errstate(divide="ignore"):
+            switch = np.maximum(np.log(self.follow), -1e30)
+        return np.concatenate([[0], np.cumsum(least)]), np.log(go), np.log1p(-go), switch
+
+    def decode(
+        self, scores: Array, step_s: float, allocate: Allocator = np.empty
+    ) -> NDArray[np.int64]:
+        """The most probable sequence of words (Viterbi).
+
+        Args:
+            scores: (m, K) log scores of each tick.
+            step_s: step of the clock, s.
+            allocate: allocator of the back-pointers, (m, K) twice.
+
+        Returns:
+            (m,) int64 index of the word of every tick.
+        """
+        scores = np.ascontiguousarray(scores)
+        terms = self._terms(step_s)
+        check_shapes("a recording", ("scores", scores, ("m", len(terms[0]) - 1)))
+        value = np.empty(terms[0][-1])
+        label = np.zeros(len(scores), np.int64)
+        came_from = allocate(scores.shape, np.int16)
+        stayed = allocate(scores.shape, np.bool_)
+        for ticks in blocks(len(scores), _DECODED_PIECE):
+            kernels.go_on(ticks.start, ticks.stop, scores, *terms, value, came_from, stayed)
+        kernels.trace_back(terms[0], value, came_from, stayed, label)
+        return label
+
+    def probabilities(self, scores: Array, step_s: float, allocate: Allocator = np.empty) -> Array:
+        """The posterior of each word at every tick (forward-backward).
+
+        Computed in blocks of 8192 ticks with a margin of 512 on either side.
+
+        Args:
+            scores: (m, K) log scores of each tick.
+            step_s: step of the clock, s.
+            allocate: allocator of the result.
+
+        Returns:
+            (m, K) probabilities, rows sum to 1.
+        """
+        terms = self._terms(step_s)
+        check_shapes("a recording", ("scores", scores, ("m", len(terms[0]) - 1)))
+        out = allocate(scores.shape, float)
+        for ticks in blocks(len(scores), _DECODED_PIECE):
+            low = max(0, ticks.start - _MARGIN)
+            high = min(len(scores), ticks.stop + _MARGIN)
+            piece = np.empty((high - low, scores.shape[1]))
+            kernels.probabilities(np.ascontiguousarray(scores[low:high]), *terms, piece)
+            out[ticks] = piece[ticks.start - low : ticks.stop - low]
+        return out
+
+
 Broken = Callable[[int, int, str], str]
+
+
+# The recogniser.
 
 
 @dataclass(frozen=True)
@@ -53,49 +167,9 @@ class Refused:
     why: str
 
 
-class FrameCheck:
-    """Checks bouts of ticks by their frames.
-
-    Args:
-        broken: returns what contradicts a word's definition in frames [start, stop); None skips the
-            check.
-        first: row of the first frame of the segment.
-        tick: (r,) tick of each of its frames, ascending.
-    """
-
-    def __init__(self, broken: Broken | None, first: int, tick: NDArray[np.int64]) -> None:
-        self._broken = broken
-        self._first = first
-        self._tick = tick
-
-    def broken(self, start: int, stop: int, word: str) -> tuple[slice, str]:
-        """The frames of a bout of ticks, and what contradicts its word's definition in them.
-
-        Args:
-            start: first tick.
-            stop: tick after the last.
-            word: the bout's name.
-        """
-        a, b = (self._first + int(k) for k in np.searchsorted(self._tick, [start, stop]))
-        if self._broken is None or word == UNLABELLED or a == b:
-            return slice(a, b), ""
-        return slice(a, b), self._broken(a, b, word)
-
-
-def overlap(one: slice, other: slice) -> bool:
-    """Whether two spans of frames have a frame in common."""
-    return one.start < other.stop and other.start < one.stop
-
-
-def commonest(values: NDArray[np.int64]) -> int:
-    """The most frequent of some values (n,), not negative, n at least 1; of equals the smallest."""
-    return int(np.bincount(values).argmax())
-
-
-Array = NDArray[np.float64]
-
+# ticks per second of an animal's recogniser
 CLOCKS_HZ = {"fish": 50.0}
-_CLOCK_HZ = 30.0
+CLOCK_HZ = 30.0
 # ticks per block of features
 _PIECE = 16_384
 _MARGIN_S = 1.5
@@ -232,9 +306,8 @@ class TimelineModel:
             tick = np.clip(
                 np.round((time_s[first:last] - begin) / step).astype(int), 0, len(scores) - 1
             )
-            decoded = self._decode(
-                scores, speed, allocate, FrameCheck(broken, first, tick), refused
-            )
+            row = first + np.searchsorted(tick, np.arange(len(scores) + 1))
+            decoded = self._decode(scores, speed, allocate, row, broken, refused)
             certain = self.chain.probabilities(scores, step, allocate)
             for piece in blocks(last - first, _PIECE):
                 rows = slice(first + piece.start, first + piece.stop)
@@ -254,7 +327,9 @@ class TimelineModel:
             probability,
             self.unresolved(track.times_ns),
             tuple(
-                Refused(rows, self.words[word], self.words[commonest(code[rows])], why)
+                Refused(
+                    rows, self.words[word], self.words[int(np.bincount(code[rows]).argmax())], why
+                )
                 for rows, word, why in refused
             ),
         )
@@ -283,14 +358,16 @@ class TimelineModel:
         scores: Array,
         speed: Array,
         allocate: Allocator,
-        check: FrameCheck,
+        row: NDArray[np.int64],
+        broken: Broken | None,
         refused: list[tuple[slice, int, str]],
     ) -> NDArray[np.int64]:
         """The most probable words (m,), whose bouts satisfy their definitions.
 
         Scores (m, K) of bouts that do not are lowered in place and decoded again, at most six
         times; a bout that still contradicts its definition becomes unlabelled. `refused` gets the
-        frames, word and reason of each contradicting bout.
+        frames, word and reason of each contradicting bout; `row` (m + 1,) is the first frame at or
+        after each tick.
         """
         nothing = self.words.index(UNLABELLED)
         for left in reversed(range(_MOST_DECODED)):
@@ -299,11 +376,16 @@ class TimelineModel:
             slow = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
             false = np.zeros(len(starts), bool)
             for k, (start, stop, word) in enumerate(zip(starts, stops, words, strict=True)):
-                rows, why = check.broken(start, stop, self.words[word])
+                a, b = int(row[start]), int(row[stop])
+                if broken is None or word == nothing or a == b:
+                    continue
+                why = broken(a, b, self.words[word])
                 if why:
                     false[k] = True
-                    if not any(word == w and overlap(rows, other) for other, w, _ in refused):
-                        refused.append((rows, int(word), why))
+                    if not any(
+                        word == w and a < other.stop and other.start < b for other, w, _ in refused
+                    ):
+                        refused.append((slice(a, b), int(word), why))
                     if not left:
                         decoded[start:stop] = nothing
             wrong = slow | false
@@ -341,8 +423,8 @@ class TimelineModel:
             if part is not None and rate < part.least_hz - _RATE_SLACK_HZ:
                 reasons.append(
                     f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} "
-                    f"frames at {rate:.0f} per second: that it happened may be told, but not how "
-                    f"fast, how often or when exactly, which wants {part.least_hz:.0f} per second"
+                    f"frames at {rate:.0f} per second: the action is found, but how fast, how "
+                    f"often and when exactly needs {part.least_hz:.0f} per second"
                 )
             if reasons:
                 found[word] = "; ".join(reasons)
@@ -424,11 +506,6 @@ def steady_speed(segment: Segment, names: Sequence[str]) -> Array:
     return np.asarray(
         uniform_filter1d(segment.values[:, names.index("speed")], width, mode="nearest")
     )
-
-
-def clock_of(skeleton: Skeleton) -> float:
-    """Ticks per second of an animal's recogniser: 50 for the fish, else 30."""
-    return CLOCKS_HZ.get(skeleton.name, _CLOCK_HZ)
 
 
 def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: float) -> Examples:

@@ -1,7 +1,7 @@
 """Vocabularies of the bundled ethograms: definitions of the words, and limits of their bouts.
 
 A `Definition` is a sentence and its measurable limits. The numbers in the sentence, the clause
-printed after it and the check of every bout (`behaviour.measures`) all come from these limits.
+printed after it and the check of every bout (`behaviour.bouts`) all come from these limits.
 Thresholds are starting values, from the literature.
 """
 
@@ -22,12 +22,12 @@ class Measure(NamedTuple):
     """A measure of a bout that a definition may bound.
 
     Attributes:
-        says: its name in a sentence.
+        label: its name in a sentence.
         unit: the displayed unit, with its space if any.
         kept: the size of a displayed unit in the unit of the measure.
     """
 
-    says: str
+    label: str
     unit: str = ""
     kept: float = 1.0
 
@@ -82,7 +82,7 @@ class Limit(NamedTuple):
     def shown(self, value: float) -> str:
         """A value, in the unit of the measure, in words and in the displayed unit."""
         measure = MEASURES[self.measure]
-        return f"{measure.says} {value / measure.kept:.3g}{measure.unit}"
+        return f"{measure.label} {value / measure.kept:.3g}{measure.unit}"
 
     @property
     def span(self) -> str:
@@ -94,11 +94,6 @@ class Limit(NamedTuple):
         if math.isinf(self.least):
             return f"at most {high}{measure.unit}"
         return f"{low} to {high}{measure.unit}"
-
-    @property
-    def told(self) -> str:
-        """The check, in words."""
-        return f"{MEASURES[self.measure].says} {self.span}"
 
 
 @dataclass(frozen=True)
@@ -127,15 +122,12 @@ class Definition:
     @property
     def printed(self) -> str:
         """The definition with the limits that are checked for every bout."""
-        return f"{self.sentence} (checked: {', '.join(limit.told for limit in self.limits)})"
+        checked = (f"{MEASURES[limit.measure].label} {limit.span}" for limit in self.limits)
+        return f"{self.sentence} (checked: {', '.join(checked)})"
 
 
 def _defined(pattern: str, *limits: Limit) -> Definition:
     return Definition(pattern, limits)
-
-
-def _deg(degrees: float) -> float:
-    return math.radians(degrees)
 
 
 _REARS = Limit("raised_bl", least=0.4)
@@ -145,35 +137,35 @@ WORDS: dict[str, dict[str, Definition]] = {
             "forward swim with tail beats, {0} to {1} lengths/s, bends below about {2} degrees in "
             "all, no turn",
             Limit("speed_bl_s", 0.7, 4.0, about=ABOUT),
-            Limit("usual_bend_rad", most=_deg(32.0), about=ABOUT),
+            Limit("usual_bend_rad", most=math.radians(32.0), about=ABOUT),
         ),
         "j_turn": _defined(
             "slow turn of up to {0} degrees by repeated one-sided bends far caudally, the front "
             "half straight",
-            Limit("either_turn_rad", most=_deg(45.0), about=ABOUT),
+            Limit("either_turn_rad", most=math.radians(45.0), about=ABOUT),
         ),
         "c_turn": _defined(
             "C-bend of more than about {0} degrees in all within some 0.1 s, then a counter-bend "
             "and a burst",
-            Limit("bend_rad", least=_deg(90.0), about=ABOUT),
+            Limit("bend_rad", least=math.radians(90.0), about=ABOUT),
         ),
         "r_turn": _defined(
             "routine turn by a single bend of about {0} to {1} degrees in all, without a strong "
             "counter-bend",
-            Limit("bend_rad", _deg(45.0), _deg(110.0), about=ABOUT),
+            Limit("bend_rad", math.radians(45.0), math.radians(110.0), about=ABOUT),
         ),
         "surface": _defined(
             "swims up, pitch above about {0} degrees",
-            Limit("pitch_rad", least=_deg(15.0), about=ABOUT),
+            Limit("pitch_rad", least=math.radians(15.0), about=ABOUT),
         ),
         "dive": _defined(
             "swims down, pitch below about {0} degrees",
-            Limit("pitch_rad", most=_deg(-15.0), about=ABOUT),
+            Limit("pitch_rad", most=math.radians(-15.0), about=ABOUT),
         ),
         "zigzag": _defined(
             "erratic: turns of {0} degrees and more that change side every 0.2 to 0.4 s, at "
             "raised speed",
-            Limit("swing_rad", least=_deg(65.0)),
+            Limit("swing_rad", least=math.radians(65.0)),
         ),
         "thrash": _defined(
             "large alternating bends of the whole body with little displacement",
@@ -194,12 +186,12 @@ WORDS: dict[str, dict[str, Definition]] = {
         ),
         "turn_left": _defined(
             "turns by more than {0} degrees to its left, at up to {1} cm/s",
-            Limit("left_turn_rad", least=_deg(30.0)),
+            Limit("left_turn_rad", least=math.radians(30.0)),
             Limit("speed_mm_s", most=150.0),
         ),
         "turn_right": _defined(
             "turns by more than {0} degrees to its right, at up to {1} cm/s",
-            Limit("right_turn_rad", least=_deg(30.0)),
+            Limit("right_turn_rad", least=math.radians(30.0)),
             Limit("speed_mm_s", most=150.0),
         ),
         "rear_supported": _defined(
@@ -307,7 +299,7 @@ FASTEST: dict[str, dict[str, Fastest]] = {
 
 NO_POSE = "#EE6677"
 PREDICTED_ERROR = "#997700"
-UNLABELLED = "#E2E2DC"
+UNLABELLED_COLOUR = "#E2E2DC"
 PALETTE = (
     "#FFAABB",
     "#CCBB44",
@@ -351,7 +343,7 @@ def action_colours(words: Sequence[str]) -> dict[str, str]:
     """The colour of each word of a vocabulary, as #rrggbb; colours repeat beyond the palette."""
     chosen: dict[str, str] = {}
     for word in words:
-        if word in _OWN and _OWN[word] not in chosen.values():
+        if _OWN.get(word, "") not in {"", *chosen.values()}:
             chosen[word] = _OWN[word]
     free = [colour for colour in PALETTE if colour not in chosen.values()]
     left = cycle(free or PALETTE)

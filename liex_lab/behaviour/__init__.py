@@ -3,10 +3,9 @@
 Input and output are pandas tables.
 """
 
-from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
+from liex_lab.behaviour.activity import Surroundings
+from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts, measure_bouts
 from liex_lab.behaviour.kinematics import kinematics
-from liex_lab.behaviour.measures import measure_bouts
-from liex_lab.behaviour.places import Surroundings
 from liex_lab.behaviour.summary import Behaviour, measure, measure_rows, measure_session, summarise
 
 __all__ = [

@@ -129,7 +129,7 @@ _BEND = ("bend_rad", "Bend", "of the whole body, positive to the left", "rad", _
 
 
 @dataclass(frozen=True)
-class Curve:
+class DrawnMeasure:
     """A measure over time.
 
     Attributes:
@@ -170,46 +170,45 @@ def axis_of(animal: Mapping[str, Any]) -> BodyAxis:
     return BodyAxis.of(animal["joints"], parents_of(animal))
 
 
-def curves_of(animal: Mapping[str, Any]) -> tuple[Curve, ...]:
+def drawn_measures(animal: Mapping[str, Any]) -> tuple[DrawnMeasure, ...]:
     """The measures drawn over time for an animal, the most common first.
 
     Args:
         animal: the section `animal` of a session.json.
     """
     body = axis_of(animal)
-    speed = Curve("speed_mm_s", "Speed", "of the body centre", "mm/s", _BLUE)
+    speed = DrawnMeasure("speed_mm_s", "Speed", "of the body centre", "mm/s", _BLUE)
     if body.kind == SWIMS:
         return (
             speed,
-            Curve("z_mm", "Height", "of the body centre above the floor", "mm", _GREEN),
-            Curve(*_BEND),
-            Curve("tail_beat_hz", "Tail beat", "frequency", "Hz", _PURPLE),
+            DrawnMeasure("z_mm", "Height", "of the body centre above the floor", "mm", _GREEN),
+            DrawnMeasure(*_BEND),
+            DrawnMeasure("tail_beat_hz", "Tail beat", "frequency", "Hz", _PURPLE),
         )
     if body.kind == BRANCHES:
+        base = body.joints[body.rear].replace("_", " ")  # where the limbs meet
         opened = f"of {_limb_names(body)}; 1: stretched out"
         return (
             speed,
-            Curve("z_mm", "Height", f"of the {_base(body)} above the background", "mm", _GREEN),
-            Curve("opening", "Opening", opened, "", _PURPLE, False),
+            DrawnMeasure("z_mm", "Height", f"of the {base} above the background", "mm", _GREEN),
+            DrawnMeasure("opening", "Opening", opened, "", _PURPLE, False),
         )
     front = body.joints[body.front].replace("_", " ").capitalize()
-    return (speed, Curve("nose_height_mm", f"{front} height", "above the floor", "mm", _GREEN))
+    return (
+        speed,
+        DrawnMeasure("nose_height_mm", f"{front} height", "above the floor", "mm", _GREEN),
+    )
 
 
-def logged_of(animal: Mapping[str, Any]) -> tuple[Curve, ...]:
+def logged_of(animal: Mapping[str, Any]) -> tuple[DrawnMeasure, ...]:
     """The measures over time in a replay: the drawn ones, and the bend of a chain.
 
     Args:
         animal: the section `animal` of a session.json.
     """
-    drawn = curves_of(animal)
+    drawn = drawn_measures(animal)
     bends = axis_of(animal).kind == STANDS
-    return (*drawn, Curve(*_BEND)) if bends else drawn
-
-
-def _base(body: BodyAxis) -> str:
-    """Name of the joint at which the limbs meet."""
-    return body.joints[body.rear].replace("_", " ")
+    return (*drawn, DrawnMeasure(*_BEND)) if bends else drawn
 
 
 def _limb_names(body: BodyAxis) -> str:

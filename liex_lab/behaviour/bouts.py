@@ -1,6 +1,10 @@
-"""Rule-based ethogram of a mouse (rear, run, walk, pause) by double thresholds on speed and height.
+"""Table `bouts`: measures of bouts, contradictions to their definitions, rule-based mouse ethogram.
 
-One label per frame, half-open bouts, never across a gap. For every action: hysteresis (two
+Bouts are named by a rule, a model or a person. The limits of a definition come from
+`actions.vocabulary`.
+
+Rules name the actions of a mouse (rear, run, walk, pause) by double thresholds on speed and height:
+one label per frame, half-open bouts, never across a gap. For every action: hysteresis (two
 thresholds, enter and leave), then interruptions shorter than `merge_pauses_s` are bridged, then
 bouts shorter than `min_bout_s` are dropped. If two actions claim a frame, the first of `ACTIONS`
 wins. Default thresholds: Live Mouse Tracker (de Chaumont et al. 2019).
@@ -8,58 +12,380 @@ wins. Default thresholds: Live Mouse Tracker (de Chaumont et al. 2019).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.behaviour.kinematics import segments
-from liex_lab.behaviour.measures import measure_bouts
-from liex_lab.tables.rows import constant_runs, frame_count, stop_times
-from liex_lab.tables.schema import BOUTS, to_pandas
+from liex_lab.actions.vocabulary import limits_of, printed_meanings
+from liex_lab.behaviour.body import STANDS, SWIMS, kind_of
+from liex_lab.behaviour.kinematics import Joints, kinematics, segments, smallest_turn
+from liex_lab.plan.sections import BehaviourThresholds
+from liex_lab.runtime.memory import Allocator
+from liex_lab.tables.rows import Rows, constant_runs, frame_count, median_step, stop_times
+from liex_lab.tables.schema import BOUTS, table_columns, to_pandas
+
+if TYPE_CHECKING:
+    from liex_lab.actions.timeline import Recognised, TimelineModel
+    from liex_lab.tracking.track import Track
+
+
+Array = NDArray[np.float64]
+_MOST_LAG_S = 0.25  # longest time of a wave for a third of the body
+# between the curvatures of two thirds of the body, for a wave to be accepted
+_LEAST_CORRELATION = 0.5
+
+
+class BoutReader:
+    """The table `kinematics` as arrays, from which rows [start, stop) of a bout are measured.
+
+    Args:
+        kinematics: the table of one animal.
+        meanings: word -> printed definition, for `broken`; only those of the bundled vocabularies
+            have limits, see `actions.vocabulary.limits_of`.
+    """
+
+    def __init__(self, kinematics: pd.DataFrame, meanings: Mapping[str, str] | None = None) -> None:
+        self._limits = {word: limits_of(text) for word, text in (meanings or {}).items()}
+        self.frame_index = kinematics["frame_index"].to_numpy()
+        self.time_s = kinematics["time_s"].to_numpy(float)
+        self.hold_s = stop_times(self.time_s) - self.time_s
+        step = median_step(self.time_s)
+        self.fps = 1.0 / step if step > 0 else 0.0
+        self.position = kinematics[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
+        self.kind = kind_of(kinematics)
+        self._columns = {
+            str(name): values.to_numpy(float)
+            for name, values in kinematics.items()
+            if values.dtype == float
+        }
+        length = self._columns["length_mm"]
+        self.length_mm = float(np.nanmedian(length)) if np.isfinite(length).any() else np.nan
+
+    def rows_of(self, bouts: pd.DataFrame) -> list[tuple[int, int]]:
+        """The rows [start, stop) of every bout, at least one row each.
+
+        Args:
+            bouts: the table `bouts`; start_frame and stop_frame are frame indices of the camera.
+        """
+        starts = np.searchsorted(self.frame_index, bouts["start_frame"].to_numpy())
+        stops = np.searchsorted(self.frame_index, bouts["stop_frame"].to_numpy())
+        n = len(self.frame_index)
+        return [
+            (min(int(a), n - 1), min(max(int(b), int(a) + 1), n))
+            for a, b in zip(starts, stops, strict=True)
+        ]
+
+    def measure(self, start: int, stop: int) -> dict[str, float]:
+        """All measures of one bout except since_last_s, which needs the previous bout.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+
+        Returns:
+            Column name to value; NaN if unknown.
+        """
+        found = {**self.motion(start, stop), **self.turn(start, stop)}
+        if self.kind == SWIMS:
+            return found | self._tail(start, stop)
+        return found | self.height(start, stop) if self.kind == STANDS else found
+
+    def broken(self, start: int, stop: int, word: str) -> str:
+        """The contradictions between a bout and its word's definition, in words; empty if none.
+
+        Args:
+            start: first row of the bout.
+            stop: row after its last.
+            word: its name.
+        """
+        found = []
+        for limit in self._limits.get(word, ()):
+            values = _READ[limit.measure](self, start, stop)
+            wrong = [value for value in values if not limit.holds(value)]
+            if wrong:
+                found.append(f"{limit.shown(wrong[0])}, not {limit.span}")
+        return "; ".join(found)
+
+    def since_last(self, bouts: pd.DataFrame, spans: Sequence[tuple[int, int]]) -> Array:
+        """(n,) time since the end of the last bout of the same action, s.
+
+        NaN for the first one, and if the animal was not observed throughout the interval.
+
+        Args:
+            bouts: the table `bouts`, in order of time.
+            spans: the rows of the n bouts, see `rows_of`.
+        """
+        number = segments(self.time_s, np.isfinite(self.position[:, 0]))
+        start, stop = np.array(spans, np.int64).reshape(-1, 2).T
+        ends = {"action": bouts["action"].to_numpy(), "stop_s": bouts["stop_s"].to_numpy(float)}
+        last = pd.DataFrame({**ends, "number": number[stop - 1]}).groupby("action").shift()
+        since = bouts["start_s"].to_numpy(float) - last["stop_s"].to_numpy()
+        return np.where(last["number"].to_numpy() == number[start], since, np.nan)
+
+    def column(self, name: str, start: int, stop: int) -> Array:
+        """A column of the table `kinematics` in the rows [start, stop) of a bout."""
+        return self._columns[name][start:stop]
+
+    def seconds(self, start: int, stop: int) -> float:
+        """Duration of the bout in the rows [start, stop), s."""
+        return float(self.time_s[stop - 1] + self.hold_s[stop - 1] - self.time_s[start])
+
+    def motion(self, start: int, stop: int) -> dict[str, float]:
+        """Path, displacement and speeds of the bout in the rows [start, stop), mm and mm/s."""
+        speed = self.column("speed_mm_s", start, stop)
+        step = self.column("step_mm", start, stop)
+        known = np.flatnonzero(np.isfinite(speed))
+        path = float(np.nansum(step))
+        timed = float(self.hold_s[start:stop][known].sum())
+        observed = start + np.flatnonzero(np.isfinite(self.position[start:stop, 0]))
+        displacement = (
+            self.position[observed[-1]] - self.position[observed[0]]
+            if len(observed)
+            else np.full(3, np.nan)
+        )
+        top = _top(speed)
+        return {
+            "path_mm": path,
+            "path_bl": path / self.length_mm,
+            "displacement_mm": float(
+                np.linalg.norm(displacement if self.kind != STANDS else displacement[:2])
+            ),
+            "rise_mm": float(displacement[2]),
+            "mean_speed_mm_s": path / timed if timed > 0 else np.nan,
+            "median_speed_mm_s": of_known(np.median, speed),
+            "peak_speed_mm_s": np.nan if top is None else float(speed[top]),
+            "peak_speed_sd_mm_s": np.nan
+            if top is None
+            else float(self.column("speed_sd_mm_s", start, stop)[top]),
+            "time_to_peak_s": np.nan
+            if top is None
+            else float(self.time_s[start + top] - self.time_s[start]),
+        }
+
+    def turn(self, start: int, stop: int) -> dict[str, float]:
+        """Turning, pitch and bend of the bout in the rows [start, stop), rad."""
+        heading = self.column("heading_rad", start, stop)
+        sd = self.column("heading_sd_rad", start, stop)
+        known = np.isfinite(heading)
+        turned = np.append(0.0, np.cumsum(smallest_turn(np.diff(heading[known]))))
+        pitch = self.column("body_pitch_rad", start, stop)
+        bend = self.column("bend_rad", start, stop)
+        some = bool(known.any())
+        ends = sd[known][[0, -1]] if some else np.full(2, np.nan)
+        return {
+            "net_turn_rad": float(turned[-1]) if some else np.nan,
+            "net_turn_sd_rad": float(np.hypot(*ends)),
+            "heading_range_rad": float(np.ptp(turned)) if some else np.nan,
+            "mean_pitch_rad": of_known(np.mean, pitch),
+            "bend_max_rad": of_known(np.max, np.abs(bend)),
+        }
+
+    def height(self, start: int, stop: int) -> dict[str, float]:
+        """Nose heights of a standing animal in the rows [start, stop) of a bout, mm."""
+        nose = self.column("nose_height_mm", start, stop)
+        top = _top(nose)
+        return {
+            "peak_nose_height_mm": np.nan if top is None else float(nose[top]),
+            "peak_nose_over_rump_mm": of_known(
+                np.max, self.column("nose_over_rump_mm", start, stop)
+            ),
+            "time_to_peak_height_s": np.nan
+            if top is None
+            else float(self.time_s[start + top] - self.time_s[start]),
+        }
+
+    def _tail(self, start: int, stop: int) -> dict[str, float]:
+        angle = self.column("tail_angle_rad", start, stop)
+        bends = self.column("tail_extreme_rad", start, stop)
+        beat = self.column("tail_beat_hz", start, stop)
+        hold = self.hold_s[start:stop]
+        at = np.flatnonzero(np.isfinite(bends))
+        size = np.abs(bends[at])
+        n = len(at)
+        duration = self.seconds(start, stop)
+        left = max(of_known(np.max, angle), 0.0)
+        right = max(of_known(np.max, -angle), 0.0)
+        return {
+            "n_bends": n,
+            "n_oscillations": n / 2.0,
+            "tail_beat_hz": n / 2.0 / duration,
+            "tail_beat_max_hz": of_known(np.max, beat),
+            "tail_beat_mean_hz": of_known(np.mean, beat),
+            "tail_beat_median_hz": of_known(np.median, beat),
+            "tail_max_rad": of_known(np.max, size),
+            "tail_mean_rad": of_known(np.mean, size),
+            "tail_median_rad": of_known(np.median, size),
+            "first_bend_s": float(self.time_s[start + at[0]] - self.time_s[start]) if n else np.nan,
+            "first_bend_rad": float(bends[at[0]]) if n else np.nan,
+            "second_over_first": float(bends[at[1]] / bends[at[0]]) if n > 1 else np.nan,
+            "tail_angle_mean_rad": _mean_over(angle, hold),
+            "tail_angle_mean_abs_rad": _mean_over(np.abs(angle), hold),
+            "tail_symmetry": min(left, right) / max(left, right)
+            if max(left, right) > 0
+            else np.nan,
+            "wave_speed_mm_s": self._wave(start, stop) if n > 1 else np.nan,
+        }
+
+    def _wave(self, start: int, stop: int) -> float:
+        """Speed of the bend that travels from the middle third of the body to the rear, mm/s."""
+        middle, rear = (self.column(f"bend_{part}_rad", start, stop) for part in ("middle", "rear"))
+        if not (np.isfinite(middle).all() and np.isfinite(rear).all()) or stop - start < 8:
+            return np.nan
+        time = self.time_s[start:stop]
+        fine: Array = np.arange(
+            time[0], time[-1], 0.1 / self.fps
+        )  # true times, on an even grid ten times as fine
+        a, b = (np.interp(fine, time, curve) - curve.mean() for curve in (middle, rear))
+        most = min(int(_MOST_LAG_S * 10 * self.fps), len(fine) // 2)
+        agreement = [_correlation(a[: len(a) - lag], b[lag:]) for lag in range(most)]
+        best = int(np.argmax(agreement)) if agreement else 0
+        # at an end of the range the peak of the correlation is uncertain
+        if best in (0, most - 1) or agreement[best] < _LEAST_CORRELATION:
+            return np.nan
+        return self.length_mm / 3.0 / (best * 0.1 / self.fps)
+
+
+def _correlation(a: Array, b: Array) -> float:
+    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum()) / size if size > 0 else 0.0
+
+
+def _top(values: Array) -> int | None:
+    """Index of the largest value; None if all are NaN."""
+    return int(np.nanargmax(values)) if np.isfinite(values).any() else None
+
+
+def of_known(measure: Callable[[Array], Any], values: Array) -> float:
+    """A measure, such as `np.median`, of the finite values; NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(measure(known)) if len(known) else np.nan
+
+
+def _mean_over(values: Array, hold: Array) -> float:
+    known = np.isfinite(values)
+    time = float(hold[known].sum())
+    return float((values * hold)[known].sum()) / time if time > 0 else np.nan
+
+
+# Check of bouts against the measurable part of their definitions.
+
+
+Reading = Callable[[BoutReader, int, int], tuple[float, ...]]
+
+
+def _motion(*names: str) -> Reading:
+    return lambda bout, a, b: tuple(bout.motion(a, b)[name] for name in names)
+
+
+def _turn(name: str, sign: float = 1.0) -> Reading:
+    return lambda bout, a, b: (sign * bout.turn(a, b)[name],)
+
+
+def _beyond_noise(bout: BoutReader, a: int, b: int) -> float:
+    """Mean speed minus the apparent speed caused by pose errors, mm/s."""
+    noise = of_known(np.median, bout.column("speed_sd_mm_s", a, b))
+    return max(bout.motion(a, b)["mean_speed_mm_s"] - (0.0 if np.isnan(noise) else noise), 0.0)
+
+
+# how to read each of `actions.vocabulary.MEASURES`; with two values, both must fit
+_READ: dict[str, Reading] = {
+    "speed_mm_s": _motion("mean_speed_mm_s", "median_speed_mm_s"),
+    "peak_speed_mm_s": _motion("peak_speed_mm_s"),
+    "quiet_bl_s": lambda bout, a, b: (_beyond_noise(bout, a, b) / bout.length_mm,),
+    "speed_bl_s": lambda bout, a, b: (bout.motion(a, b)["mean_speed_mm_s"] / bout.length_mm,),
+    "duration_s": lambda bout, a, b: (bout.seconds(a, b),),
+    "left_turn_rad": _turn("net_turn_rad"),
+    "right_turn_rad": _turn("net_turn_rad", -1.0),
+    "either_turn_rad": lambda bout, a, b: (abs(bout.turn(a, b)["net_turn_rad"]),),
+    "swing_rad": _turn("heading_range_rad"),
+    "bend_rad": _turn("bend_max_rad"),
+    "usual_bend_rad": lambda bout, a, b: (
+        of_known(np.median, np.abs(bout.column("bend_rad", a, b))),
+    ),
+    "pitch_rad": _turn("mean_pitch_rad"),
+    "raised_bl": lambda bout, a, b: (bout.height(a, b)["peak_nose_over_rump_mm"] / bout.length_mm,),
+    "moved_bl": lambda bout, a, b: (bout.motion(a, b)["displacement_mm"] / bout.length_mm,),
+}
+
+
+def recognise(
+    recogniser: TimelineModel,
+    track: Track,
+    wall_mm: Array | None = None,
+    moved: pd.DataFrame | None = None,
+    allocate: Allocator = np.empty,
+) -> Recognised:
+    """The ethogram of a track, in which no bout contradicts its printed definition.
+
+    Args:
+        recogniser: names the track.
+        track: one animal's track of n frames.
+        wall_mm: (n,) distance of the animal from the nearest wall, mm; None if unknown.
+        moved: the table `kinematics` of the track; None computes it with the default settings.
+        allocate: allocator of large intermediate arrays and of the probabilities.
+    """
+    if moved is None:
+        frames = Rows(track, np.arange(track.n_frames), "", "").frames_table
+        moved = kinematics(frames, Joints.of_track(track), allocate=allocate)
+    meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
+    return recogniser.recognise(track, wall_mm, allocate, BoutReader(moved, meanings).broken)
+
+
+def measure_bouts(
+    bouts: pd.DataFrame, kinematics: pd.DataFrame, meanings: Mapping[str, str] | None = None
+) -> pd.DataFrame:
+    """The table `bouts` with its measures.
+
+    Measures that need a higher frame rate are left empty (see unreliable_below_fps in
+    columns.json).
+
+    Args:
+        bouts: needs the columns of `tables.BOUTS`; its other columns are replaced.
+        kinematics: the table `kinematics` of the same animal.
+        meanings: word -> printed definition, against which the bouts are checked; None skips the
+            check.
+
+    Returns:
+        The table with all its columns, one row per bout.
+    """
+    columns = table_columns("bouts", kind_of(kinematics))
+    reader = BoutReader(kinematics, meanings)
+    spans = reader.rows_of(bouts)
+    measured = [reader.measure(a, b) for a, b in spans]
+    block: dict[str, Any] = {c.name: bouts[c.name].to_numpy() for c in BOUTS}
+    for column in columns[len(BOUTS) :]:
+        if column.name == "since_last_s":
+            block[column.name] = reader.since_last(bouts, spans)
+        elif column.name == "contradicts":
+            block[column.name] = [
+                reader.broken(a, b, str(word))
+                for (a, b), word in zip(spans, bouts["action"], strict=True)
+            ]
+        else:
+            known = reader.fps >= (column.unreliable_below_fps or 0.0)
+            empty = 0 if column.dtype == "int64" else np.nan
+            block[column.name] = [m[column.name] if known else empty for m in measured]
+    return to_pandas(columns, block)
+
+
+# The rule-based ethogram of a mouse.
 
 ACTIONS = ("rear", "run", "walk", "pause")  # if two claim a frame, the first wins
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class MouseRules:
+class MouseRules(BehaviourThresholds):
     """Thresholds of the rule-based ethogram, by their names in a plan.
 
     `MouseRules(**plan.behaviour.model_dump())` makes them from a plan. The defaults are those of
     Live Mouse Tracker. Its rearing height of 40 mm applies to an adult of about 90 mm; a smaller
     animal rears from 0.6 of its own length. A bout of rearing extends down to two thirds of that
     height.
-
-    Attributes:
-        speed_half_window_s: speed at t is measured between frames this far before and after it, s.
-        pause_below_mm_s: slower than this is a pause, mm/s.
-        run_above_mm_s: faster than this is a run, mm/s.
-        impossible_above_mm_s: faster than this is a tracking error, mm/s.
-        rear_height_mm: height of the nose above the tail's base in an adult's rear, mm.
-        rear_height_bl: the same for a smaller animal, in body lengths.
-        rear_leave: rearing lasts down to this share of its height.
-        speed_hysteresis: a threshold is crossed upwards this share above it, downwards this share
-            below it.
-        merge_pauses_s: shorter interruptions of a bout are bridged, s.
-        min_bout_s: shorter bouts are dropped, s.
     """
-
-    speed_half_window_s: float = 0.034
-    pause_below_mm_s: float = 50.0
-    run_above_mm_s: float = 300.0
-    impossible_above_mm_s: float = 3000.0
-    rear_height_mm: float = 40.0
-    rear_height_bl: float = 0.6
-    rear_leave: float = 2.0 / 3.0
-    # a threshold is crossed upwards 10 % above it, downwards 10 % below
-    speed_hysteresis: float = 0.1
-    merge_pauses_s: float = 0.33
-    min_bout_s: float = 0.23
 
     def rear_mm(self, spine_mm: float) -> float:
         """Least height of the nose above the tail's base in a rear, mm, for a spine of

@@ -252,12 +252,13 @@ def _tested(
     if engine == "mixed" or (engine == "auto" and enough):
         model = mixed_model(rows, units, groups)
         if model is not None:
-            what = "the animals' means" if model.random == CAGE else "the sessions' values"
+            found, p, random = model
+            what = "the animals' means" if random == CAGE else "the sessions' values"
             name = (
-                f"mixed model of {what}, random intercept per {model.random}, t with units - 2 "
-                "degrees of freedom"
+                f"mixed model of {what}, random intercept per {random}, t with units - 2 degrees "
+                "of freedom"
             )
-            return {"p": model.p, "test": name, **_sized(model.found, rows, groups)}
+            return {"p": p, "test": name, **_sized(found, rows, groups)}
     check_reachable(units, alpha, groups)
     within = " within blocks" if len(np.unique(units.block)) > 1 else ""
     of = "signs of the animals' own differences" if units.paired else f"{units.unit}s{within}"
@@ -320,7 +321,7 @@ def _plain(value: float) -> str:
 def methods(
     stats: pd.DataFrame,
     table: pd.DataFrame | None = None,
-    said: Sequence[str] = (),
+    notes: Sequence[str] = (),
     alpha: float = 0.05,
 ) -> str:
     """Text for a methods section: groups, units, tests, intervals, correction, software.
@@ -328,7 +329,7 @@ def methods(
     Args:
         stats: the table `stats`, see `compare`.
         table: the compared sessions, see `collect`; None omits their number.
-        said: sentences on the sessions, such as which are left out.
+        notes: sentences on the sessions, such as which are left out.
         alpha: the significance level in the text.
 
     Returns:
@@ -353,7 +354,7 @@ def methods(
     lines = Path(__file__).with_name("methods.j2").read_text(encoding="utf-8").split()
     text = Template(" ".join(lines), undefined=StrictUndefined).render(
         groups=[] if table is None else _of_groups(table),
-        notes=said,
+        notes=notes,
         units=sorted(set(done["unit"])),
         tests=tests,
         intervals=[name for name, used in intervals.items() if used],

@@ -37,6 +37,12 @@ class NotComparable(Exception):
     """Raised if the design does not allow a test; the message is one sentence for the reader."""
 
 
+def _require(holds: bool, sentence: str) -> None:
+    """Refuse a comparison with a sentence for the reader unless a condition holds."""
+    if not holds:
+        raise NotComparable(sentence)
+
+
 @dataclass(frozen=True)
 class Units:
     """The n units of one comparison of two groups.
@@ -90,34 +96,32 @@ def find_units(
     """
     rows = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
     nameless = int((rows["subject_id"] == "").sum())
-    if nameless:
-        raise NotComparable(
-            f"{nameless} sessions do not say which animal they are of; state subject_id in the "
-            "study"
-        )
+    _require(
+        nameless == 0,
+        f"{nameless} sessions do not say which animal they are of; state subject_id in the study",
+    )
     of_animal = rows.groupby("subject_id")["group"].nunique()
     both = [str(name) for name in of_animal.index[of_animal > 1]]
     if both and len(both) == len(of_animal):
         return _own_differences(rows, groups)
-    if both:
-        raise NotComparable(
-            f"{len(both)} of {len(of_animal)} animals ({', '.join(both[:3])}) were in both groups "
-            "and the others in one; compare those within themselves, or the others with each other"
-        )
+    _require(
+        not both,
+        f"{len(both)} of {len(of_animal)} animals ({', '.join(both[:3])}) were in both groups and "
+        "the others in one; compare those within themselves, or the others with each other",
+    )
     animals = _animals(rows, blocks)
     second = (animals["group"] == groups[1]).to_numpy()
     for group, number in ((groups[0], int((~second).sum())), (groups[1], int(second.sum()))):
-        if number < 2:
-            raise NotComparable(
-                f"the group {group} has {number} animals with a value, and a comparison needs two"
-            )
+        _require(
+            number >= 2,
+            f"the group {group} has {number} animals with a value, and a comparison needs two",
+        )
     cage = animals["cage"].to_numpy(str)
     unknown = int((cage == "").sum())
-    if 0 < unknown < len(cage):
-        raise NotComparable(
-            f"the cage of {unknown} of {len(cage)} animals is not stated; state it for all, or for "
-            "none"
-        )
+    _require(
+        unknown in (0, len(cage)),
+        f"the cage of {unknown} of {len(cage)} animals is not stated; state it for all or none",
+    )
     crowded = len(set(cage)) < len(cage) and bool(cage[0])
     mixed = crowded and _hold_both(cage, second)
     block = _blocks(animals, [*(["cage"] if mixed else []), *blocks], second)
@@ -138,8 +142,10 @@ def _animals(rows: pd.DataFrame, blocks: Sequence[str]) -> pd.DataFrame:
     for name in ("group", "cage", *(block for block in blocks if block in rows)):
         of_session = rows[name].to_numpy(str)
         columns[name] = of_session[first]
-        if (columns[name][animal] != of_session).any():
-            raise NotComparable(f"some animals are in more than one {name}; give each animal one")
+        _require(
+            bool((columns[name][animal] == of_session).all()),
+            f"some animals are in more than one {name}; give each animal one",
+        )
     return pd.DataFrame(columns)
 
 
@@ -196,8 +202,10 @@ def _whole_cages(
         n=("value", "size"),
         blocks=("block", "nunique"),
     )
-    if (cages["blocks"] > 1).any():
-        raise NotComparable("some cages are in more than one batch; give each cage one")
+    _require(
+        bool((cages["blocks"] == 1).all()),
+        "some cages are in more than one batch; give each cage one",
+    )
     return Units(
         CAGE,
         cages["value"].to_numpy(float),
@@ -211,8 +219,7 @@ def _own_differences(rows: pd.DataFrame, groups: tuple[str, str]) -> Units:
     """One value per animal: its mean in the second group minus its mean in the first."""
     means = rows.groupby(["subject_id", "group"])["value"].mean().unstack("group")
     values = (means[groups[1]] - means[groups[0]]).to_numpy(float)
-    if len(values) < 2:
-        raise NotComparable("only one animal was in both groups, and a comparison needs two")
+    _require(len(values) >= 2, "only one animal was in both groups, and a comparison needs two")
     n = len(values)
     return Units(PAIRED, values, np.ones(n, bool), np.zeros(n, np.int64), np.ones(n, np.int64))
 
@@ -410,22 +417,9 @@ def _differences(units: Units, rng: np.random.Generator | None) -> Array:
     return total
 
 
-@dataclass(frozen=True)
-class ModelResult:
-    """Result of a linear mixed model.
-
-    Attributes:
-        found: the fixed effect of the group with its 95 % interval.
-        p: two-sided p of that effect.
-        random: the factor with a random intercept: cage or animal.
-    """
-
-    found: Estimate
-    p: float
-    random: str
-
-
-def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> ModelResult | None:
+def mixed_model(
+    rows: pd.DataFrame, units: Units, groups: tuple[str, str]
+) -> tuple[Estimate, float, str] | None:
     """Linear mixed model of a group difference, fitted by restricted maximum likelihood (REML).
 
     value ~ group + (1 | cage) on the animals' means if whole cages were assigned, otherwise value ~
@@ -438,22 +432,21 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
         groups: names of the first and the second group.
 
     Returns:
-        None for paired units, if nothing is nested or the units are exchanged within blocks (the
-            permutation test is sufficient), and if the model does not converge or its random
-            variance is zero, which makes its errors unreliable.
+        The fixed effect of the group with its 95 % interval, its two-sided p, and the factor with a
+            random intercept: cage or animal. None for paired units, if nothing is nested or the
+            units are exchanged within blocks (the permutation test is sufficient), and if the model
+            does not converge or its random variance is zero, which makes its errors unreliable.
     """
     from scipy.stats import t
 
-    data = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
     if units.paired:
         return None
-    if units.unit == CAGE:
-        data = (
-            data.groupby("subject_id")
-            .agg({"value": "mean", "group": "first", "cage": "first"})
-            .reset_index()
-        )
-    clusters = data["cage" if units.unit == CAGE else "subject_id"].to_numpy(str)
+    data = rows[rows["group"].isin(groups) & np.isfinite(rows["value"].to_numpy(float))]
+    random = units.unit if units.unit == CAGE else ANIMAL
+    if random == CAGE:
+        animals = data.groupby("subject_id")
+        data = animals.agg({"value": "mean", "group": "first", "cage": "first"}).reset_index()
+    clusters = data["cage" if random == CAGE else "subject_id"].to_numpy(str)
     if len(np.unique(clusters)) == len(clusters) or len(np.unique(units.block)) > 1:
         # nothing is nested, or animals are exchanged within blocks: permutation is sufficient
         return None
@@ -466,11 +459,7 @@ def mixed_model(rows: pd.DataFrame, units: Units, groups: tuple[str, str]) -> Mo
     freedom = len(np.unique(clusters)) - 2
     reach = float(t.ppf(0.975, freedom)) * error
     p = float(2.0 * t.sf(abs(difference) / error, freedom))
-    return ModelResult(
-        Estimate(difference, difference - reach, difference + reach),
-        p,
-        "cage" if units.unit == CAGE else "animal",
-    )
+    return Estimate(difference, difference - reach, difference + reach), p, random
 
 
 def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[float, float] | None:

@@ -1,6 +1,6 @@
 """All behaviour tables of one animal, and the summary: one row with the main results.
 
-Combines `kinematics`, `bouts`, `measures`, `activity` (with transitions) and `places`; the summary
+Combines `kinematics`, `bouts` and `activity` (with transitions, zones and places); the summary
 adds distance, speeds, turn bias, time budget (count, time, share, rate and latency of each action,
 and of all rears together) and times in zones. Shares are of the observed time, and count observed
 frames only.
@@ -9,7 +9,7 @@ frames only.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,19 +17,21 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
-from liex_lab.behaviour.activity import activity, observed_hold, time_named, transitions
-from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
-from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts
-from liex_lab.behaviour.kinematics import Joints, kinematics
-from liex_lab.behaviour.measures import measure_bouts, of_known
-from liex_lab.behaviour.places import (
+from liex_lab.behaviour.activity import (
     Surroundings,
+    activity,
     depth_measures,
     inside_zones,
+    observed_hold,
     place_measures,
     surface_height_mm,
+    time_named,
+    transitions,
     visits,
 )
+from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
+from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts, measure_bouts, of_known
+from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import BEHAVIOUR, GAPS, Vocabulary, empty_table, rears_of, to_pandas
@@ -79,7 +81,7 @@ class Behaviour:
             "results": self.tables,
             "columns": self.vocabulary.columns,
             "actions": self.actions,
-            "record": {"rules": asdict(self.rules)},
+            "record": {"rules": self.rules.model_dump()},
         }
 
 
@@ -207,7 +209,7 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
     """
     about = session.metadata
     known = about.get("rules") or {}
-    stated = {name: known[name] for name in MouseRules.__dataclass_fields__ if name in known}
+    stated = {name: known[name] for name in MouseRules.model_fields if name in known}
     surface = surface_height_mm(
         about["camera"]["floor_distance_mm"], about["camera"].get("optics", {})
     )

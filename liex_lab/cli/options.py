@@ -144,7 +144,7 @@ def to_json(result: Any) -> str:
 
 
 def tell_scores(report: dict[str, Any]) -> None:
-    """Print scores of recognised actions (`actions.scores.timeline_scores`).
+    """Print scores of recognised actions (`actions.labels.timeline_scores`).
 
     Args:
         report: the scores of leave-one-animal-out; empty if there are none.

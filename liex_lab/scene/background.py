@@ -10,8 +10,11 @@ time still shows its background. A mode is a cluster of at least a twentieth of 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +24,8 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.scene import _height_map_kernels as kernels
-from liex_lab.scene.floor import Floor, near_plane
+from liex_lab.scene.floor import Floor, near_plane, parts
 from liex_lab.scene.support_plane import (
-    SampledScene,
     SupportPlane,
     find_support_plane,
     levelled,
@@ -96,14 +98,14 @@ def has_noise(sample: NDArray[np.float32]) -> bool:
     return len(shares) > 0 and float(np.median(shares)) > _EVERYWHERE
 
 
-def usual_depth(depth_images: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def usual_depth(depth_images: NDArray[Any]) -> NDArray[Any]:
     """Median of each pixel over the images in which it was read.
 
     Args:
-        depth_images: (n, H, W) uint16 mm, 0 where unread.
+        depth_images: (n, ...) mm, 0 where unread.
 
     Returns:
-        (H, W) uint16 mm, 0 where never read.
+        (...) mm of the same type, 0 where never read.
     """
     ordered = np.sort(depth_images, axis=0)
     unread = (ordered == 0).sum(axis=0)
@@ -292,24 +294,92 @@ def unread_floor(
     Returns:
         (H, W) bool: pixels whose background should be the floor but is not.
     """
-    import cv2
-
     dark = on_floor & ((sample > 0).mean(axis=0) < _READ)
     raised = dark & (background > 0) & (bare - background > min_height_mm)
-    found = np.zeros(dark.shape, np.bool_)
-    if not raised.any():
-        return found
-    n, labels, stats, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8))
     flat = (background > 0) & (np.abs(background - bare) < _FLAT_MM)
-    ring = np.ones((7, 7), np.uint8)
-    for k in range(1, n):
-        hole = labels == k
-        if stats[k, cv2.CC_STAT_AREA] < least_px or not (hole & raised).any():
-            continue
-        around = (cv2.dilate(hole.astype(np.uint8), ring) > 0) & ~dark & (background > 0)
-        if around.any() and flat[around].mean() > _AROUND:
+    found = np.zeros(dark.shape, np.bool_)
+    for hole in parts(dark, least_px) if raised.any() else ():
+        ring = cv2.dilate(hole.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+        around = ring & ~dark & (background > 0)
+        if (hole & raised).any() and around.any() and flat[around].mean() > _AROUND:
             found |= hole & raised
     return found
+
+
+# A lasting change of the scene: the camera was displaced, or its scene rearranged.
+
+_N_PARTS = 4
+_LEAST_FRAMES = 8  # of a part
+_N_CHANGE_PIXELS = 10_000
+_ELSEWHERE_MM = 12.0  # exceeds the drift and noise that remain in a median
+_LEAST_SHARE = 0.06  # of the readings
+_LEAST_ANIMALS = 4.0  # in areas of the animal, whose own movement changes up to two
+
+
+@dataclass(frozen=True)
+class SceneChange:
+    """A lasting change of the still scene.
+
+    Attributes:
+        at_s: when it happened, s since the first frame.
+        share: of the readable image that changed.
+    """
+
+    at_s: float
+    share: float
+
+    @staticmethod
+    def find(
+        sample: NDArray[np.float32], times_s: Array, camera: Camera, area_mm2: float
+    ) -> SceneChange | None:
+        """Find the change of a recording from frames spread over it.
+
+        Args:
+            sample: (n, H, W) float32 mm, the frames, 0 where unread.
+            times_s: (n,) of the frames, s since the first.
+            camera: of those pixels.
+            area_mm2: the animal's usual area seen from above, mm^2.
+
+        Returns:
+            The change; None if the scene does not change, or too few frames are given.
+        """
+        check_shapes("frames", ("sample", sample, ("n", "H", "W")), ("times_s", times_s, ("n",)))
+        n_parts = min(_N_PARTS, len(sample) // _LEAST_FRAMES)
+        if n_parts < 2:
+            return None
+        step = max(1, int(np.sqrt(sample[0].size / _N_CHANGE_PIXELS)))
+        depths = sample[:, ::step, ::step].reshape(len(sample), -1)
+        usual = [_usual(part) for part in np.array_split(depths, n_parts)]
+        found = None
+        for a, b in [*zip(range(n_parts), range(1, n_parts), strict=False), (0, n_parts - 1)]:
+            read = (usual[a] > 0) & (usual[b] > 0)
+            changed_px = read & (np.abs(usual[b] - usual[a]) > _ELSEWHERE_MM)
+            share = float(changed_px.sum() / max(read.sum(), 1))
+            pixels_mm2 = (step * usual[a][changed_px].astype(float)) ** 2 / (camera.fx * camera.fy)
+            is_more = share > (found[0] if found else _LEAST_SHARE)
+            if is_more and pixels_mm2.sum() > _LEAST_ANIMALS * area_mm2:
+                found = share, usual[a][changed_px], usual[b][changed_px], changed_px
+        if found is None:
+            return None
+        share, before, after, changed_px = found
+        readings = depths[:, changed_px]
+        is_after = (np.abs(readings - after) < np.abs(readings - before)).mean(axis=1) > 0.5
+        since = int(np.argmax(is_after & np.append(is_after[1:], True)))
+        return SceneChange(float(times_s[since]), share)
+
+    @property
+    def sentence(self) -> str:
+        """The change in words."""
+        return (
+            f"the camera was displaced or its scene rearranged at {self.at_s:.1f} s "
+            f"({self.share:.0%} of the image changed): cut the recording there"
+        )
+
+
+def _usual(depths: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The median (P,) of the readings in frames (n, P), mm; 0 where most are unread."""
+    often = 2 * (depths > 0).sum(axis=0) >= len(depths)
+    return np.where(often, usual_depth(depths), np.float32(0))
 
 
 # The empty scene of sampled frames: background, floor and foreground limit.
@@ -349,24 +419,47 @@ class TargetAnimal:
 
 
 @dataclass(frozen=True)
+class SampledScene:
+    """Sampled frames of a recording, their background, and the expected animals.
+
+    Attributes:
+        sample: (n, H, W) float32 mm, the frames, 0 where unread.
+        background: (H, W) float32 mm, 0 where unknown.
+        spread: (H, W) float32 mm, its standard deviation.
+        near: (H, W) float32 mm, the nearest usual depth.
+        camera: of these pixels, free of lens distortion.
+        target: the animals.
+    """
+
+    sample: Depths
+    background: Depths
+    spread: Depths
+    near: Depths
+    camera: Camera
+    target: TargetAnimal
+
+    @staticmethod
+    def learn(sample: Depths, camera: Camera, target: TargetAnimal) -> SampledScene:
+        """The scene of sampled frames; see `SampledScene` for the arguments."""
+        return SampledScene(sample, *learn_background(sample), camera, target)
+
+    @property
+    def least_ground_mm2(self) -> float:
+        """Area of the smallest ground that such an animal can stand on, mm^2."""
+        return 4.0 * self.target.smallest_mm2
+
+
+@dataclass(frozen=True)
 class BareGround:
     """The empty scene before its animal is identified.
 
     Attributes:
-        background: (H, W) float32 mm, 0 where unknown.
-        spread: (H, W) float32 mm, its standard deviation.
-        near: (H, W) float32 mm, the nearest usual depth.
+        scene: the sampled frames and their background, which is unknown outside of the region.
         support_plane: the detected floor.
-        camera: of these pixels.
-        target: the animal to detect.
     """
 
-    background: Depths
-    spread: Depths
-    near: Depths
+    scene: SampledScene
     support_plane: SupportPlane
-    camera: Camera
-    target: TargetAnimal
 
     @staticmethod
     def learn(
@@ -374,7 +467,7 @@ class BareGround:
         camera: Camera,
         target: TargetAnimal,
         stated: Floor | None = None,
-        region: NDArray[np.bool_] | None = None,
+        region: Mask | None = None,
     ) -> BareGround:
         """Learn the ground from a sample of frames.
 
@@ -388,20 +481,18 @@ class BareGround:
         Raises:
             EstimationError: no depth was read, no depth recurs often enough, or no floor was found.
         """
-        background, spread, near = learn_background(sample)
-        _check_background(sample, background)
-        sampled_scene = SampledScene(
-            sample, background, spread, camera, target.spine_mm, target.min_height_mm, target.view
-        )
-        support_plane = find_support_plane(sampled_scene, stated)
+        scene = SampledScene.learn(sample, camera, target)
+        _check_background(sample, scene.background)
+        plane = find_support_plane(scene, stated)
         if region is not None:
-            support_plane = replace(
-                support_plane, region=region, on_floor=support_plane.on_floor & region
+            plane = replace(plane, region=region, on_floor=plane.on_floor & region)
+        if plane.region is not None:  # exclude the surroundings
+            background, near = (
+                np.where(plane.region, depth, np.float32(0))
+                for depth in (scene.background, scene.near)
             )
-        if support_plane.region is not None:  # exclude the surroundings
-            background = np.where(support_plane.region, background, np.float32(0))
-            near = np.where(support_plane.region, near, np.float32(0))
-        return BareGround(background, spread, near, support_plane, camera, target)
+            scene = replace(scene, background=background, near=near)
+        return BareGround(scene, plane)
 
     @staticmethod
     def steady(
@@ -409,8 +500,8 @@ class BareGround:
         camera: Camera,
         target: TargetAnimal,
         floor: Floor | None = None,
-        region: NDArray[np.bool_] | None = None,
-    ) -> tuple[BareGround, Depths, FloorLevel | None]:
+        region: Mask | None = None,
+    ) -> tuple[BareGround, FloorLevel | None]:
         """The same after correcting drift of the floor's depth.
 
         Args:
@@ -421,86 +512,68 @@ class BareGround:
             region: (H, W) bool, analysed pixels; None for all.
 
         Returns:
-            The ground, the corrected sample, and the reference level, None if the floor does not
-            drift.
+            The ground with the corrected sample, and the reference level, None if the floor does
+            not drift.
 
         Raises:
             EstimationError: as `learn`.
         """
-        stated = (
-            None if floor is None else Floor.from_plane(floor.normal, floor.distance_mm, camera)
-        )
+        stated = None if floor is None else floor.for_camera(camera)
         ground = BareGround.learn(sample, camera, target, stated, region)
-        level = ground.level
-        levels = level.of(sample) if target.stands_on_floor else np.empty(0)
-        wander = wandering(levels) if target.stands_on_floor else None
+        if not target.stands_on_floor:
+            return ground, None
+        levels = ground.level.of(sample)
+        wander = wandering(levels)
         if wander is None:
-            return ground, sample, None
-        first, range_mm = wander
-        sample = level.brought_back(sample, levels - first)
+            return ground, None
+        sample = ground.level.brought_back(sample, levels - wander[0])
         ground = BareGround.learn(sample, camera, target, stated, region)
-        return ground, sample, replace(ground.level, wander_mm=range_mm)
+        return ground, replace(ground.level, wander_mm=wander[1])
 
-    def _sampled(self, sample: Depths) -> SampledScene:
-        """A sample (n, H, W) mm combined with the empty scene."""
-        target = self.target
-        return SampledScene(
-            sample,
-            self.background,
-            self.spread,
-            self.camera,
-            target.spine_mm,
-            target.min_height_mm,
-            target.view,
-        )
-
-    def under(self, sample: Depths, masks: list[NDArray[np.bool_]]) -> BareGround:
+    def under(self, masks: list[Mask]) -> BareGround:
         """The same with the plane fitted to the ground under a resting animal, see `levelled`.
 
         Args:
-            sample: (n, H, W) float32 mm, the frames used for learning.
             masks: (H, W) bool each, the animal's pixels in some frames.
         """
-        movers = [still_object(own, self.background, self.camera, k) for k, own in enumerate(masks)]
-        return replace(
-            self, support_plane=levelled(self.support_plane, self._sampled(sample), movers)
-        )
+        background, camera = self.scene.background, self.scene.camera
+        movers = [still_object(own, background, camera, k) for k, own in enumerate(masks)]
+        return replace(self, support_plane=levelled(self.support_plane, self.scene, movers))
 
-    @property
+    @cached_property
     def level(self) -> FloorLevel:
         """The level of its bare floor."""
-        return FloorLevel.on(
-            self.background, self.support_plane.on_floor & near_plane(self.background, self._bare)
-        )
+        background = self.scene.background
+        on_floor = self.support_plane.on_floor & near_plane(background, self._bare)
+        return FloorLevel.on(background, on_floor)
 
     @property
     def _bare(self) -> Depths:
         """Depth (H, W) mm of the floor's plane."""
-        return self.support_plane.floor.depth(self.camera.width, self.camera.height)
+        camera = self.scene.camera
+        return self.support_plane.floor.depth(camera.width, camera.height)
 
-    def background_and_limit(self, sample: Depths) -> tuple[Depths, Depths]:
+    def background_and_limit(self) -> tuple[Depths, Depths]:
         """The background, with the floor's plane where it is unknown, and the foreground limit.
-
-        Args:
-            sample: (n, H, W) float32 mm, the frames used for learning.
 
         Returns:
             Both (H, W) float32 mm; readings below the limit are foreground.
         """
-        background = self.background
-        spread = self.spread
-        bare = self._bare
-        on_floor = self.support_plane.on_floor
-        min_height_mm = self.target.min_height_mm
-        if self.target.stands_on_floor:
-            px_mm2 = self.support_plane.floor.distance_mm**2 / (self.camera.fx * self.camera.fy)
-            least_px = self.target.smallest_mm2 / px_mm2
-            dark = unread_floor(sample, background, bare, on_floor, min_height_mm, least_px)
-            background = np.where(dark, np.float32(0), background)
-            spread = np.where(dark, np.float32(0), spread)
+        scene, camera, target = self.scene, self.scene.camera, self.scene.target
+        background, spread = scene.background, scene.spread
+        bare, on_floor = self._bare, self.support_plane.on_floor
+        if target.stands_on_floor:
+            px_mm2 = self.support_plane.floor.distance_mm**2 / (camera.fx * camera.fy)
+            least_px = target.smallest_mm2 / px_mm2
+            dark = unread_floor(
+                scene.sample, background, bare, on_floor, target.min_height_mm, least_px
+            )
+            background, spread = (
+                np.where(dark, np.float32(0), values) for values in (background, spread)
+            )
         background = np.where((background == 0) & on_floor, bare, background)
-        behind = np.where(on_floor, background, self.near)
-        margin = np.maximum(np.float32(min_height_mm), np.float32(SPREADS) * spread)
+        behind = np.where(on_floor, background, scene.near)
+        margin = np.maximum(np.float32(target.min_height_mm), np.float32(SPREADS) * spread)
         return background, np.maximum(behind - margin, 0).astype(np.float32)
 
 

@@ -14,7 +14,10 @@ rest, wholly or in part, and therefore absorbed into the background.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self, TypeVar
 
 import cv2
 import numpy as np
@@ -24,26 +27,540 @@ from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera, SensorCard
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.shapes import check_shapes
+from liex_lab.runtime.threads import threads
+from liex_lab.scene import _height_map_kernels as kernels
+from liex_lab.scene._blob_kernels import MAX_BLOBS
 from liex_lab.scene.background import SPREADS as SPREADS  # models are trained with it
 from liex_lab.scene.background import (
     BareGround,
     FloorLevel,
+    SceneChange,
     TargetAnimal,
     sample_frames,
     sampled,
     stride_for,
 )
 from liex_lab.scene.floor import Floor
+from liex_lab.scene.height_maps import HeightMaps, Segmenter, pack_crop_cameras, size_misfit
 from liex_lab.scene.objects import (
     find_resting_animal,
     find_transient_objects,
     is_like_an_animal,
     with_its_still_part,
 )
-from liex_lab.scene.still_scene import SceneChange, StillScene
-from liex_lab.scene.worn import Cable, HeadStage
+from liex_lab.scene.scene import Fixture, Scene, find_fixtures, region_corners, roughness
+from liex_lab.scene.support_plane import SupportPlane
+from liex_lab.scene.worn import Cable, Worn, find_worn
 
+Array = NDArray[np.float64]
 Depths = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+AnyNumber = TypeVar("AnyNumber", bound=np.generic)
+
+# of the logarithms, from posture to posture of one animal
+_SIZE_SD = (0.25, 0.2)
+_ALIKE = np.log(1.5)  # areas that differ by less belong to one object
+_OTHER = 3.0  # ratio of areas beyond which it is another object
+
+
+@dataclass(frozen=True)
+class BackgroundSubtraction(Segmenter):
+    """The empty scene of one camera, and the depth limit of the foreground.
+
+    Attributes:
+        camera: the ideal pinhole camera of the recording.
+        floor: the floor plane in that camera's frame.
+        background: (H, W) float32 mm, depth of the empty scene, 0 where unknown.
+        limit: (H, W) float32 mm; a reading below it is foreground.
+        on_floor: (H, W) bool, the visible floor: an animal stands on it with at least a part of its
+            body.
+        area_mm2: the animal's usual area seen from above, mm^2; 0 while unknown.
+        volume_mm3: the animal's usual volume under its back, mm^3; 0 while unknown.
+        view: how such animals are viewed.
+        stride: step between analysed rows and columns of the image; H and W count those.
+        support_plane: how the floor was found; None if it was given.
+        worn: how worn devices are separated from the animal, in the order of their removal.
+        level: reference level of the floor; None if it does not drift.
+        changed: a lasting change of the scene; None without one.
+        sensor: quality of its readings; None without a sample.
+        transient_objects: objects that stand on the floor for a part of the recording.
+    """
+
+    camera: Camera
+    floor: Floor
+    background: Depths
+    limit: Depths
+    on_floor: Mask
+    area_mm2: float = 0.0
+    volume_mm3: float = 0.0
+    view: CameraView = MOUSE_VIEW
+    stride: int = 1
+    support_plane: SupportPlane | None = None
+    level: FloorLevel | None = None
+    worn: tuple[Worn, ...] = ()
+    changed: SceneChange | None = None
+    sensor: SensorCard | None = None
+    transient_objects: tuple[Fixture, ...] = ()
+
+    @cached_property
+    def grid(self) -> Camera:
+        """The camera of the analysed pixels: every `stride`-th of the image."""
+        return self.camera.every(self.stride)
+
+    @cached_property
+    def grid_floor(self) -> Floor:
+        """The floor in pixels of that camera."""
+        return self.floor if self.stride == 1 else self.floor.for_camera(self.grid)
+
+    @cached_property
+    def bare(self) -> Depths:
+        """(H, W) float32 mm, depth of the floor's plane in the analysed pixels."""
+        return self.grid_floor.depth(self.grid.width, self.grid.height)
+
+    def described(self) -> Scene:
+        """The scene as written to session.json, without its outline."""
+        fixtures = find_fixtures(self.background, self.grid_floor, self.grid, self.on_floor)
+        described = Scene(
+            self.floor,
+            roughness_mm=roughness(self.background, self.bare, self.on_floor),
+            fixtures=(*fixtures, *self.transient_objects),
+            doubts=self.doubts,
+            wander_mm=None if self.level is None else self.level.wander_mm,
+            thin_above=any(isinstance(device, Cable) for device in self.worn),
+            sensor=self.sensor,
+        )
+        found = self.support_plane
+        if found is None:
+            return described
+        return replace(
+            described,
+            floor_from=found.origin,
+            floor_support=found.support if found.moves else None,
+            n_moving=found.n_moving,
+            n_animals=found.n_together,
+            region_px=region_corners(found.region, self.stride),
+            doubts=(*filter(None, [found.doubt]), *self.doubts),
+        )
+
+    def every(self, step: int) -> Self:
+        """The same segmenter for images of every `step`-th row and column."""
+        camera = self.camera.every(step)
+        cut = (slice(None, None, step), slice(None, None, step))
+        return replace(
+            self,
+            camera=camera,
+            floor=self.floor.for_camera(camera),
+            background=np.ascontiguousarray(self.background[cut]),
+            limit=np.ascontiguousarray(self.limit[cut]),
+            on_floor=np.ascontiguousarray(self.on_floor[cut]),
+            level=None if self.level is None else self.level.every(step),
+            worn=tuple(device.every(step) for device in self.worn),
+        )
+
+    def misfit(self, crops: HeightMaps) -> Array:
+        """See `Segmenter`.
+
+        An animal that swims or is lifted is judged by its area alone, as the space below it is not
+        its own.
+        """
+        stands = self.view.frame == VIEWS[0]
+        return size_misfit(crops, self.area_mm2, self.volume_mm3 if stands else None, _SIZE_SD)
+
+    def view_rotation(self, camera_view: bool) -> Array:
+        """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame.
+
+        Args:
+            camera_view: whether heights are measured along the optical axis.
+        """
+        return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
+
+    def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The reference plane of each height map: the floor, or one behind the animal.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in image pixels.
+        """
+        if not camera_view:
+            return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
+        level = np.zeros((len(crops.step), 3))
+        level[:, 2] = 1.0 / crops.distance
+        return level
+
+    def middles(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The centroid (n, 3) mm of each height map, in the arena frame.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+        """
+        middle = crops.centroid
+        if camera_view:  # the view's frame is not the arena's
+            middle[:, 2] -= crops.distance
+            middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
+        return middle
+
+    def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
+        """The crop cameras of height maps: intrinsics, T_view_camera, origin and step of each crop.
+
+        Args:
+            crops: n height maps.
+            camera_view: as they were extracted.
+
+        Returns:
+            (n, 17), packed as `CropCamera`.
+        """
+        camera = self.camera
+        return pack_crop_cameras(
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            self.view_rotation(camera_view),
+            crops.distance,
+            crops.origin,
+            crops.step,
+        )
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Corrections applied to the images, in sentences."""
+        drift = (
+            ()
+            if self.level is None
+            else (
+                f"the depth of the floor drifted by {self.level.wander_mm:.1f} mm, as of a sensor "
+                "that warms up, and was corrected to its initial value",
+            )
+        )
+        return (*(device.remark for device in self.worn), *drift)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Whether the camera was displaced or the scene rearranged during the recording."""
+        return () if self.changed is None else (self.changed.sentence,)
+
+    def cleared(self, depths: Depths) -> Depths:
+        """Full images without worn cables, 0 there.
+
+        The bars of a lid remain, as they hide the animal but are not worn.
+
+        Args:
+            depths: (n, H, W) float32 mm, full images, or a sample at the scene's own stride.
+        """
+        if not self.worn:
+            return depths
+        step = 1 if depths.shape[1:] == self.limit.shape else self.stride
+        thinned = depths[:, ::step, ::step]
+        worn = np.any([device.worn(thinned, self.limit) for device in self.worn], axis=0)
+        return np.where(at_every_pixel(worn, step, depths.shape[1:]), np.float32(0), depths)
+
+    def animal_masks(self, crops: HeightMaps) -> list[Mask]:
+        """The animal's pixels (H, W) bool in each frame that shows it.
+
+        Args:
+            crops: of frames at this scene's stride, see `extract`.
+        """
+        masks = []
+        for i in np.flatnonzero(crops.found):
+            rows, columns = np.nonzero(crops.heights[i])
+            step, (u, v) = crops.step[i] // self.stride, crops.origin[i] // self.stride
+            own = np.zeros(self.limit.shape, np.bool_)
+            own[v + step * rows, u + step * columns] = True
+            masks.append(own)
+        return masks
+
+    def usual_area(
+        self,
+        depths: Depths,
+        spine_mm: tuple[float, float],
+        without_mm2: Sequence[float] = (),
+    ) -> tuple[float, float]:
+        """The component area that recurs in most frames, and the share of frames that contain it.
+
+        The animal has nearly constant size and is in nearly every frame; other objects appear,
+        disappear or differ in size. The result is the mode of a kernel density over the logarithm
+        of area, to which each frame adds its nearest component with a Gaussian kernel of standard
+        deviation 0.35.
+
+        Args:
+            depths: (n, H, W) float32 mm, frames at this scene's stride.
+            spine_mm: lengths of the smallest and the largest expected animal, mm; they bound the
+                area.
+            without_mm2: areas to exclude, with those within a factor of 1.5.
+
+        Returns:
+            The area, mm^2, and the share (0 to 1) of frames with a component within a factor of 4
+            of it; both 0 if no component has an animal's size.
+        """
+        self._check(depths)
+        areas = np.zeros((len(depths), MAX_BLOBS))
+        bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
+        kernels.blob_areas(
+            depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas
+        )
+        low = self.view.area[0] * spine_mm[0] ** 2
+        high = self.view.area[1] * spine_mm[1] ** 2
+        for other in without_mm2:
+            areas[np.abs(np.log(np.maximum(areas, 1e-9) / other)) < _ALIKE] = 0.0
+        candidates = np.sort(areas[(areas > low) & (areas < high)])
+        if not len(candidates):
+            return 0.0, 0.0
+        tried = candidates[
+            np.linspace(0, len(candidates) - 1, min(200, len(candidates))).astype(int)
+        ]
+        distance = np.abs(np.log(np.maximum(areas, 1e-9)[None] / tried[:, None, None])).min(axis=2)
+        support = np.exp(-0.5 * (distance / 0.35) ** 2).sum(axis=1)
+        best = tried[np.argmax(support)]
+        return float(best), float(
+            (distance[np.argmax(support)] < np.log(kernels.AREA_FACTOR)).mean()
+        )
+
+    def usual_volume(self, depths: Depths) -> float:
+        """The animal's median volume, mm^3, over frames in which nothing else has a similar area.
+
+        If fewer than 5 frames qualify, all frames with the animal count.
+
+        Args:
+            depths: (n, H, W) float32 mm, frames at this scene's stride.
+        """
+        crops = self.extract(depths, 1.0)
+        volume, n_blobs = crops.blobs.volume_mm3, crops.n_blobs
+        alone = n_blobs == 1 if (n_blobs == 1).sum() >= 5 else n_blobs > 0
+        return float(np.median(volume[alone]))
+
+    def _check(self, depths: Depths) -> None:
+        """Refuse frames whose size differs from that of the scene."""
+        check_shapes("frames of this scene", ("depths", depths, ("n", *self.limit.shape)))
+
+    def extract(
+        self,
+        depths: Depths,
+        size: float,
+        parallel: bool = True,
+        camera_view: bool = False,
+        n_candidates: int = 1,
+    ) -> HeightMaps:
+        """Height maps of the components whose areas are nearest to the animal's own.
+
+        Heights are measured above the floor, or (camera_view) from the view's behind_mm behind the
+        animal's mean depth, as in the paper's features.
+
+        Args:
+            depths: (n, H, W) float32 mm, full images, or a sample at the scene's own stride.
+            size: the animal's spine length over the skeleton's home length; scales the smoothing.
+            parallel: whether to use all threads.
+            camera_view: whether heights are measured along the optical axis.
+            n_candidates: per frame, 1 or 2.
+
+        Returns:
+            The rows (n) of the best components, then (n_candidates 2) those of the second best;
+            origin, step and n_px are in pixels of the full image.
+        """
+        if depths.shape[1:] != self.limit.shape:
+            depths = depths[:, :: self.stride, :: self.stride]
+        self._check(depths)
+        if self.level is not None:
+            depths = self.level.brought_back(depths)
+        for device in self.worn:
+            depths = device.cut(depths, self.limit)
+        crops = HeightMaps.blank(n_candidates * len(depths), self.floor.distance_mm)
+        grid = self.grid
+        with threads(parallel):
+            kernels.extract_all(
+                depths,
+                self.limit,
+                self.on_floor,
+                self.area_mm2,
+                n_candidates,
+                camera_view,
+                kernels.Sight(
+                    np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
+                    self.grid_floor.inverse_depth,
+                    self.view_rotation(camera_view),
+                    behind_mm=self.view.behind_mm if camera_view else 0.0,
+                    smooth_mm=self.view.smooth_mm * size,
+                ),
+                crops.rows,
+            )
+        if self.stride > 1:  # in pixels of the full image
+            for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
+                values *= self.stride * factor
+        return crops
+
+    @staticmethod
+    def from_floor(
+        camera: Camera, floor: Floor, min_height_mm: float = 7.0
+    ) -> BackgroundSubtraction:
+        """A segmenter whose background is the bare floor plane.
+
+        Args:
+            camera: the ideal pinhole camera.
+            floor: the floor plane in its frame.
+            min_height_mm: smaller heights above the floor are not the animal.
+        """
+        bare = floor.depth(camera.width, camera.height)
+        limit = np.maximum(bare - np.float32(min_height_mm), 0).astype(np.float32)
+        return BackgroundSubtraction(camera, floor, bare, limit, np.ones(bare.shape, np.bool_))
+
+    @staticmethod
+    def learn(
+        recording: Recording,
+        spine_mm: tuple[float, float],
+        n_frames: int = 96,
+        min_height_mm: float = 7.0,
+        view: CameraView = MOUSE_VIEW,
+        floor: Floor | None = None,
+        region: Mask | None = None,
+    ) -> tuple[BackgroundSubtraction, Depths]:
+        """Learn the background subtraction of a recording from frames spread over it.
+
+        The background of a pixel is its farthest recurring depth, which remains visible although an
+        animal covers it most of the time; under an animal that never moves, the floor plane is
+        used. Rims and walls around the floor flicker between near and far, so only readings nearer
+        than the nearest usual depth are foreground there. If fewer than half of the frames show an
+        animal, it may be absorbed into its own background: the floor plane is then tried as
+        background, and kept if more frames show an animal.
+
+        Args:
+            recording: of an ideal pinhole camera, see `recordings.rectify`.
+            spine_mm: lengths of the smallest and the largest expected animal, mm.
+            n_frames: sampled frames at most.
+            min_height_mm: smaller heights above the background are not the animal.
+            view: how such animals are viewed; one that does not stand on the floor may be anywhere.
+            floor: the stated floor; None to estimate it.
+            region: (height, width) bool of the full image, analysed pixels; None for all.
+
+        Returns:
+            The segmenter, and the sample (n, H, W) float32 mm of frames that it was learned from,
+            at its stride.
+
+        Raises:
+            EstimationError: no depth was read, no depth recurs often enough to be a background, no
+                floor was found, or nothing of an animal's size stands on it.
+        """
+        target = TargetAnimal(spine_mm, min_height_mm, view)
+        stride = stride_for(recording, spine_mm[0])
+        sample = sample_frames(recording, n_frames, stride)
+        cut = None
+        if region is not None:
+            cut = region[::stride, ::stride]
+            sample *= cut
+        camera = recording.camera
+        ground, level = BareGround.steady(sample, camera.every(stride), target, floor, cut)
+        times_ns = recording.times_ns[sampled(len(recording), n_frames)]
+        times_s = (times_ns - recording.times_ns[0]) * 1e-9
+        scene, sample = BackgroundSubtraction._of(camera, stride, ground, level)
+        if target.stands_on_floor and floor is None and not ground.support_plane.moves:
+            # without movers, the animal at rest decides which of two levels is the floor
+            under = ground.under(scene.animal_masks(scene.extract(sample, 1.0)))
+            if under.support_plane is not ground.support_plane:
+                scene, sample = BackgroundSubtraction._of(camera, stride, under, level)
+        changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
+        scene = replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed)
+        scene = replace(scene, sensor=read_sensor(scene, sample))
+        if target.stands_on_floor and changed is None:
+            found = find_transient_objects(scene, sample, times_s)
+            scene = replace(scene, transient_objects=found)
+        return scene, sample
+
+    @staticmethod
+    def _of(
+        camera: Camera, stride: int, ground: BareGround, level: FloorLevel | None
+    ) -> tuple[BackgroundSubtraction, Depths]:
+        """The scene of a ground with its animal, and the ground's sample without worn devices."""
+        target, sample, found = ground.scene.target, ground.scene.sample, ground.support_plane
+        background, limit = ground.background_and_limit()
+        scene = BackgroundSubtraction(
+            camera,
+            found.floor if stride == 1 else found.floor.for_camera(camera),
+            background,
+            limit,
+            found.on_floor if target.stands_on_floor else np.ones_like(found.on_floor),
+            view=target.view,
+            stride=stride,
+            support_plane=found,
+            level=level,
+        )
+        if target.stands_on_floor:
+            worn, sample = find_worn(sample, limit, found.floor, ground.scene.camera, target)
+            scene = replace(scene, worn=worn)
+        return scene._with_its_animal(sample, target), sample
+
+    def _with_its_animal(self, sample: Depths, target: TargetAnimal) -> BackgroundSubtraction:
+        """The scene with the usual area of its animal, and floor under an animal at rest.
+
+        Args:
+            sample: (n, H, W) float32 mm, frames at this scene's stride.
+            target: the expected animal.
+
+        Raises:
+            EstimationError: nothing of an animal's size stands on the floor.
+        """
+        scene = self
+        area, share = scene._moving_area(sample, target)
+        plane_moves = self.support_plane is not None and self.support_plane.moves
+        moves = share >= 0.5 or (share > 0.0 and plane_moves)
+        rests = find_resting_animal(scene, sample, target, area, share)
+        if rests is not None:
+            scene, share, _ = rests
+            area, moves = scene.area_mm2, False
+        elif target.stands_on_floor and share >= 0.5:
+            scene = with_its_still_part(scene, sample, target, area)
+            area = scene.area_mm2
+        # an object that does not move must have an animal's size and height
+        if target.stands_on_floor and share > 0.0 and not moves:
+            as_animal = replace(scene, area_mm2=area)
+            share = share if is_like_an_animal(as_animal, sample, target) else 0.0
+        if share == 0.0:
+            raise EstimationError(
+                f"no animal was found in {len(sample)} frames spread over the recording: nothing "
+                f"between {target.smallest_mm2:.0f} and {target.largest_mm2:.0f} mm^2 stands on "
+                "the floor; check the depth unit, or set animal.spine_min_mm and spine_max_mm in "
+                "the plan"
+            )
+        return replace(scene, area_mm2=area)
+
+    def _moving_area(self, sample: Depths, target: TargetAnimal) -> tuple[float, float]:
+        """The usual area mm^2, and the share of the frames that show it, see `usual_area`.
+
+        If that differs clearly from the area of the moving objects, as for specks that recur in
+        more frames before the animal arrives, the area of the moving objects is used. A component
+        that resembles an animal is no speck, even if a larger object moves in and out of view.
+        """
+        area, share = self.usual_area(sample, target.spine_mm)
+        support_plane = self.support_plane
+        if support_plane is None or not support_plane.moves or self.view.frame != VIEWS[0]:
+            return area, share
+        if area > 0.0 and abs(np.log(area / support_plane.mover_mm2)) < np.log(_OTHER):
+            return area, share
+        if share >= 0.5 and is_like_an_animal(replace(self, area_mm2=area), sample, target):
+            return area, share
+        crops = replace(self, area_mm2=support_plane.mover_mm2).extract(sample, 1.0)
+        return support_plane.mover_mm2, float(crops.found.mean())
+
+
+def at_every_pixel(
+    values: NDArray[AnyNumber], step: int, shape: tuple[int, ...]
+) -> NDArray[AnyNumber]:
+    """Values of every `step`-th pixel, repeated for all pixels of the image.
+
+    Args:
+        values: (..., h, w) of every `step`-th row and column.
+        step: at least 1.
+        shape: (H, W) of the image.
+
+    Returns:
+        (..., H, W) the values.
+    """
+    for axis in (-2, -1):
+        values = np.repeat(values, step, axis=axis)
+    return values[..., : shape[0], : shape[1]]
+
+
+# The quality card of a sensor.
 
 _N_PIXELS = 20_000  # inspected for noise and edges, spread over the image
 _N_FRAMES = 12  # inspected for the seam around the animal
@@ -57,7 +574,7 @@ _REACH_PX = 4  # largest distance of the seam from the outline
 _ROUND_MM = 0.05  # a finer step is continuous
 
 
-def read_sensor(scene: StillScene, sample: Depths) -> SensorCard:
+def read_sensor(scene: BackgroundSubtraction, sample: Depths) -> SensorCard:
     """The quality card of the sensor that recorded a sample.
 
     Args:
@@ -111,7 +628,7 @@ def _step(sample: Depths) -> float | None:
     return round(gap, 3) if gap > _ROUND_MM else None
 
 
-def _seam(scene: StillScene, sample: Depths) -> float | None:
+def _seam(scene: BackgroundSubtraction, sample: Depths) -> float | None:
     """Width of the unread seam around the animal, px of the image, beyond the usual share of unread
     pixels.
     """
@@ -151,216 +668,3 @@ def _mixed(background: Depths, sample: Depths) -> float | None:
         return None
     between = read & (at > _MIDDLE[0]) & (at < _MIDDLE[1])
     return round(float(between.sum() / read.sum()), 3)
-
-
-Array = NDArray[np.float64]
-
-_OTHER = 3.0  # ratio of areas beyond which it is another object
-
-
-@dataclass(frozen=True)
-class BackgroundSubtraction(StillScene):
-    """The empty scene of one camera as learned from a recording, see `StillScene`."""
-
-    @staticmethod
-    def from_floor(
-        camera: Camera, floor: Floor, min_height_mm: float = 7.0
-    ) -> BackgroundSubtraction:
-        """A segmenter whose background is the bare floor plane.
-
-        Args:
-            camera: the ideal pinhole camera.
-            floor: the floor plane in its frame.
-            min_height_mm: smaller heights above the floor are not the animal.
-        """
-        bare = floor.depth(camera.width, camera.height)
-        limit = np.maximum(bare - np.float32(min_height_mm), 0).astype(np.float32)
-        return BackgroundSubtraction(camera, floor, bare, limit, np.ones(bare.shape, np.bool_))
-
-    @staticmethod
-    def learn(
-        recording: Recording,
-        spine_mm: tuple[float, float],
-        n_frames: int = 96,
-        min_height_mm: float = 7.0,
-        view: CameraView = MOUSE_VIEW,
-        floor: Floor | None = None,
-        region: NDArray[np.bool_] | None = None,
-    ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
-        """Learn the background subtraction of a recording from frames spread over it.
-
-        The background of a pixel is its farthest recurring depth, which remains visible although an
-        animal covers it most of the time; under an animal that never moves, the floor plane is
-        used. Rims and walls around the floor flicker between near and far, so only readings nearer
-        than the nearest usual depth are foreground there. If fewer than half of the frames show an
-        animal, it may be absorbed into its own background: the floor plane is then tried as
-        background, and kept if more frames show an animal.
-
-        Args:
-            recording: of an ideal pinhole camera, see `recordings.rectify`.
-            spine_mm: lengths of the smallest and the largest expected animal, mm.
-            n_frames: sampled frames at most.
-            min_height_mm: smaller heights above the background are not the animal.
-            view: how such animals are viewed; one that does not stand on the floor may be anywhere.
-            floor: the stated floor; None to estimate it.
-            region: (height, width) bool of the full image, analysed pixels; None for all.
-
-        Returns:
-            The segmenter, and the sample (n, H, W) float32 mm of frames that it was learned from,
-            at its stride.
-
-        Raises:
-            EstimationError: no depth was read, no depth recurs often enough to be a background, no
-                floor was found, or nothing of an animal's size stands on it.
-        """
-        target = TargetAnimal(spine_mm, min_height_mm, view)
-        stride = stride_for(recording, spine_mm[0])
-        sample = sample_frames(recording, n_frames, stride)
-        cut = None
-        if region is not None:
-            cut = region[::stride, ::stride]
-            sample *= cut
-        ground, sample, level = BareGround.steady(
-            sample, recording.camera.every(stride), target, floor, cut
-        )
-        camera = recording.camera
-        times_ns = recording.times_ns[sampled(len(recording), n_frames)]
-        times_s = (times_ns - recording.times_ns[0]) * 1e-9
-        whole = sample
-        scene, sample = BackgroundSubtraction._of(camera, stride, ground, whole, level)
-        if target.stands_on_floor and floor is None and not ground.support_plane.moves:
-            # without movers, the animal at rest decides which of two levels is the floor
-            under = ground.under(whole, scene.animal_masks(scene.extract(sample, 1.0)))
-            if under.support_plane is not ground.support_plane:
-                scene, sample = BackgroundSubtraction._of(camera, stride, under, whole, level)
-        changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
-        scene = replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed)
-        transient_objects = (
-            find_transient_objects(scene, sample, times_s)
-            if target.stands_on_floor and changed is None
-            else ()
-        )
-        return replace(
-            scene, sensor=read_sensor(scene, sample), transient_objects=transient_objects
-        ), sample
-
-    @staticmethod
-    def _of(
-        camera: Camera,
-        stride: int,
-        ground: BareGround,
-        sample: NDArray[np.float32],
-        level: FloorLevel | None,
-    ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
-        """The scene of a ground with its animal, and the sample without worn devices."""
-        scene = BackgroundSubtraction._empty(camera, stride, ground, sample, level)
-        if ground.target.stands_on_floor:
-            scene, sample = scene._without_worn(sample, ground.target)
-        return scene._with_its_animal(sample, ground.target), sample
-
-    @staticmethod
-    def _empty(
-        camera: Camera,
-        stride: int,
-        ground: BareGround,
-        sample: NDArray[np.float32],
-        level: FloorLevel | None,
-    ) -> BackgroundSubtraction:
-        """The scene of a ground before its animal is identified.
-
-        Args:
-            camera: the ideal pinhole camera of the recording.
-            stride: of the analysed pixels.
-            ground: the empty scene.
-            sample: (n, H, W) float32 mm, the frames used for learning.
-            level: reference level of the floor; None if it does not drift.
-        """
-        background, limit = ground.background_and_limit(sample)
-        on_floor = ground.support_plane.on_floor
-        plane = ground.support_plane.floor
-        return BackgroundSubtraction(
-            camera,
-            plane if stride == 1 else Floor.from_plane(plane.normal, plane.distance_mm, camera),
-            background,
-            limit,
-            on_floor if ground.target.stands_on_floor else np.ones_like(on_floor),
-            view=ground.target.view,
-            stride=stride,
-            support_plane=ground.support_plane,
-            level=level,
-        )
-
-    def _without_worn(
-        self, sample: NDArray[np.float32], target: TargetAnimal
-    ) -> tuple[BackgroundSubtraction, NDArray[np.float32]]:
-        """The scene and the sample (n, H, W) mm with cables and head stages removed, if there are
-        any.
-        """
-        scene = self
-        floor = self.grid_floor if self.support_plane is None else self.support_plane.floor
-        grid = self.grid
-        cable = Cable.find(sample, self.limit, grid, floor, target.spine_mm[1], target.smallest_mm2)
-        if cable is not None:
-            whole, sample = sample, cable.cut(sample, self.limit)
-            scene = replace(scene, cable=cable.with_fixed(whole, sample))
-        stage = HeadStage.find(sample, self.limit, grid, floor, target.smallest_mm2)
-        if stage is not None:
-            scene = replace(scene, stage=stage)
-            sample = stage.cut(sample, self.limit)
-        return scene, sample
-
-    def _with_its_animal(
-        self, sample: NDArray[np.float32], target: TargetAnimal
-    ) -> BackgroundSubtraction:
-        """The scene with the usual area of its animal, and floor under an animal at rest.
-
-        Args:
-            sample: (n, H, W) float32 mm, frames at this scene's stride.
-            target: the expected animal.
-
-        Raises:
-            EstimationError: nothing of an animal's size stands on the floor.
-        """
-        scene = self
-        area, share = scene._moving_area(sample, target)
-        moves = share >= 0.5 or (
-            share > 0.0 and self.support_plane is not None and self.support_plane.moves
-        )
-        rests = find_resting_animal(scene, sample, target, area, share)
-        if rests is not None:
-            scene, area, share = rests.scene, rests.area_mm2, rests.share
-            moves = False
-        elif target.stands_on_floor and share >= 0.5:
-            scene, area = with_its_still_part(scene, sample, target, area)
-        # an object that does not move must have an animal's size and height
-        if target.stands_on_floor and share > 0.0 and not moves:
-            as_animal = replace(scene, area_mm2=area)
-            share = share if is_like_an_animal(as_animal, sample, target) else 0.0
-        if share == 0.0:
-            raise EstimationError(
-                f"no animal was found in {len(sample)} frames spread over the recording: nothing "
-                f"between {target.smallest_mm2:.0f} and {target.largest_mm2:.0f} mm^2 stands on "
-                "the floor; check the depth unit, or set animal.spine_min_mm and spine_max_mm in "
-                "the plan"
-            )
-        return replace(scene, area_mm2=area)
-
-    def _moving_area(
-        self, sample: NDArray[np.float32], target: TargetAnimal
-    ) -> tuple[float, float]:
-        """The usual area mm^2, and the share of the frames that show it, see `usual_area`.
-
-        If that differs clearly from the area of the moving objects, as for specks that recur in
-        more frames before the animal arrives, the area of the moving objects is used. A component
-        that resembles an animal is no speck, even if a larger object moves in and out of view.
-        """
-        area, share = self.usual_area(sample, target.spine_mm)
-        support_plane = self.support_plane
-        if support_plane is None or not support_plane.moves or self.view.frame != VIEWS[0]:
-            return area, share
-        if area > 0.0 and abs(np.log(area / support_plane.mover_mm2)) < np.log(_OTHER):
-            return area, share
-        if share >= 0.5 and is_like_an_animal(replace(self, area_mm2=area), sample, target):
-            return area, share
-        crops = replace(self, area_mm2=support_plane.mover_mm2).extract(sample, 1.0)
-        return support_plane.mover_mm2, float(crops.found.mean())

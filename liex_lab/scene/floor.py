@@ -12,8 +12,10 @@ camera's x.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,7 @@ from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 # pixels that vote for a plane, and planes tried
 _N_VOTERS = 6000
@@ -127,12 +130,24 @@ class Floor:
             )
         return found
 
+    def inverse_at(self, u: NDArray[Any], v: NDArray[Any]) -> Array:
+        """1 / depth of the plane in pixels (u, v), 1/mm."""
+        a, b, c = self.inverse_depth
+        return np.asarray(a * u + b * v + c)
+
+    def heights(self, u: NDArray[Any], v: NDArray[Any], depth: NDArray[Any]) -> Array:
+        """Heights above the plane, mm, of readings `depth` mm in pixels (u, v)."""
+        return np.asarray(self.distance_mm * (1.0 - depth * self.inverse_at(u, v)))
+
+    def for_camera(self, camera: Camera) -> Floor:
+        """The same plane in the pixels of another camera at the same position."""
+        return Floor.from_plane(self.normal, self.distance_mm, camera)
+
     def depth(self, width: int, height: int) -> NDArray[np.float32]:
         """Depth (height, width) float32 mm of the bare floor in every pixel; 0 above
         the horizon.
         """
-        a, b, c = self.inverse_depth
-        inverse = a * np.arange(width)[None, :] + b * np.arange(height)[:, None] + c
+        inverse = self.inverse_at(np.arange(width)[None, :], np.arange(height)[:, None])
         return np.where(inverse > 1e-6, 1.0 / np.maximum(inverse, 1e-6), 0.0).astype(np.float32)
 
 
@@ -162,19 +177,11 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
         )
     rng = np.random.default_rng(seed)
     chosen = rng.choice(len(rows), min(_N_FITTED, len(rows)), replace=False)
-    rows = rows[chosen]
-    columns = columns[chosen]
+    rows, columns = rows[chosen], columns[chosen]
     depth = background[rows, columns].astype(float)
-    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
-    # pixels relative to the image's middle, in units of its size, for numerical precision
-    points = np.stack(
-        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
-        axis=1,
-    )
+    points, middle = _centred(rows, columns, background.shape)
     plane = _largest_plane(points[:_N_VOTERS], depth[:_N_VOTERS], camera.fx / middle[0], rng)
-    share = 0.0
-    for _ in range(3):  # least squares on many pixels, not only on the voters
-        plane, share = _refit(points, depth, plane)
+    plane, share = _refit(points, depth, plane, 3)  # on many pixels, not only on the voters
     floor = _in_pixels(plane, middle, camera)
     tilt = np.degrees(np.arccos(np.clip(floor.normal[2], -1, 1)))
     if share < _MIN_SHARE or tilt > _MAX_TILT_DEG:
@@ -202,19 +209,30 @@ def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Gen
     a = (rise[:, 0] * ends[:, 1, 1] - rise[:, 1] * ends[:, 0, 1]) / area
     b = (ends[:, 0, 0] * rise[:, 1] - ends[:, 1, 0] * rise[:, 0]) / area
     planes = np.stack([a, b, w[:, 0] - a * p[:, 0, 0] - b * p[:, 0, 1]], axis=1)
-    steepness = (
-        np.hypot(a, b) * focal / np.where(planes[:, 2] > 0, planes[:, 2], np.nan)
-    )  # tangent of the tilt
-    planes = planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))]
+    planes = _facing(planes, focal)
     for n_kept, n_voters in ((20, _N_VOTERS // 6), (1, _N_VOTERS)):
-        votes = _is_near(points[:n_voters] @ planes.T, depth[:n_voters, None]).sum(axis=0)
+        votes = _on(points[:n_voters] @ planes.T, depth[:n_voters, None]).sum(axis=0)
         planes = planes[np.argsort(-votes, kind="stable")[:n_kept]]
     return planes[0] if len(planes) else np.array([0.0, 0.0, 1.0 / float(np.median(depth))])
 
 
-def _is_near(inverse: Array, depth: Array) -> NDArray[np.bool_]:
-    """Whether points at `depth` lie within `_INLIER_MM` of a plane with 1 / z = inverse."""
-    return np.asarray(np.abs(depth * inverse - 1.0) < _INLIER_MM * inverse)
+def _facing(planes: Array, focal: float) -> Array:
+    """Those of the planes (n, 3) that face the camera; focal: in the units of their points."""
+    rise = np.hypot(planes[:, 0], planes[:, 1]) * focal
+    steepness = rise / np.where(planes[:, 2] > 0, planes[:, 2], np.nan)  # tangent of the tilt
+    return np.asarray(planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))])
+
+
+def _centred(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], shape: tuple[int, ...]
+) -> tuple[Array, Array]:
+    """Pixels as points (..., 3) for planes, and the image's middle (2,) px.
+
+    They are relative to the middle, in units of its size, for numerical precision.
+    """
+    middle = np.array([shape[1] / 2.0, shape[0] / 2.0])
+    x, y = (columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0]
+    return np.stack([x, y, np.ones(rows.shape)], axis=-1), middle
 
 
 def _in_pixels(plane: Array, middle: Array, camera: Camera) -> Floor:
@@ -222,17 +240,31 @@ def _in_pixels(plane: Array, middle: Array, camera: Camera) -> Floor:
     return Floor.from_inverse_depth(np.array([a, b, c - a * middle[0] - b * middle[1]]), camera)
 
 
-def _refit(points: Array, depth: Array, plane: Array) -> tuple[Array, float]:
-    """The plane refitted to all points near it, and the share of these points."""
-    near = _is_near(points @ plane, depth)
-    if near.sum() < 3:
-        return plane, 0.0
-    some = points[near]
-    fitted = np.linalg.lstsq(some.T @ some, some.T @ (1.0 / depth[near]), rcond=None)[0]
-    return np.asarray(fitted, float), float(near.mean())
+def _fit(points: Array, depth: Array) -> Array:
+    """The plane (3,) nearest to points (n, 3) at depth (n,) mm, by least squares."""
+    fitted = np.linalg.lstsq(points.T @ points, points.T @ (1.0 / depth), rcond=None)[0]
+    return np.asarray(fitted, float)
 
 
-def fit_plane(background: NDArray[np.float32], where: NDArray[np.bool_], camera: Camera) -> Floor:
+def _on(inverse: Array, depth: Array, within_mm: float = _INLIER_MM) -> Mask:
+    """Whether points at `depth` lie within `within_mm` of the plane with 1 / z = inverse."""
+    return np.asarray((depth > 0) & (np.abs(depth * inverse - 1.0) < within_mm * inverse))
+
+
+def _refit(
+    points: Array, depth: Array, plane: Array, rounds: int, least: int = 3
+) -> tuple[Array, float]:
+    """The plane refitted to the points near it, and their share; 0 if fewer than `least` are."""
+    share = 0.0
+    for _ in range(rounds):
+        near = _on(points @ plane, depth)
+        if near.sum() < least:
+            return plane, 0.0
+        plane, share = _fit(points[near], depth[near]), float(near.mean())
+    return plane, share
+
+
+def fit_plane(background: NDArray[np.float32], where: Mask, camera: Camera) -> Floor:
     """The plane of some pixels, by least squares on inverse depth.
 
     Args:
@@ -241,17 +273,11 @@ def fit_plane(background: NDArray[np.float32], where: NDArray[np.bool_], camera:
         camera: free of lens distortion.
     """
     rows, columns = np.nonzero(where)
-    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
-    points = np.stack(
-        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
-        axis=1,
-    )
-    inverse = 1.0 / background[where].astype(float)
-    plane = np.linalg.lstsq(points.T @ points, points.T @ inverse, rcond=None)[0]
-    return _in_pixels(np.asarray(plane, float), middle, camera)
+    points, middle = _centred(rows, columns, background.shape)
+    return _in_pixels(_fit(points, background[where].astype(float)), middle, camera)
 
 
-def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> Mask:
     """The convex hull of the largest connected part of the background on the plane.
 
     Floors of arenas and tanks are convex; the hull closes holes left by objects. Without a
@@ -264,17 +290,11 @@ def floor_region(background: NDArray[np.float32], bare: NDArray[np.float32]) -> 
     Returns:
         (H, W) bool.
     """
-    import cv2
-
     patch = floor_patch(background, bare)
-    if not patch.any():
-        return near_plane(background, bare)
-    region = np.zeros(patch.shape, np.uint8)
-    cv2.fillConvexPoly(region, cv2.convexHull(cv2.findNonZero(patch.astype(np.uint8))), 1)
-    return region.astype(bool)
+    return convex_hull(patch) if patch.any() else near_plane(background, bare)
 
 
-def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> Mask:
     """The largest connected part of the background that lies on the bare floor.
 
     Pixels near the plane are opened with a square of 5 px before their components are labelled.
@@ -290,13 +310,12 @@ def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> N
 
     flat = near_plane(background, bare).astype(np.uint8)
     opened = cv2.morphologyEx(flat, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
-    if n < 2:
-        return np.zeros(flat.shape, np.bool_)
-    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
+    labels, stats = components(opened)
+    # row 0, the surroundings, counts no pixels
+    return labels == (int(np.argmax(stats[:, cv2.CC_STAT_AREA])) or -1)
 
 
-def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> NDArray[np.bool_]:
+def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> Mask:
     """Pixels (H, W) bool whose background lies within 15 mm of the bare floor (H, W) mm."""
     return (background > 0) & (np.abs(background - bare) < _FLAT_MM)
 
@@ -307,7 +326,6 @@ def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> ND
 _WINDOWS = 14  # along the image's longer side, each overlapping its neighbours by half
 _READ_SHARE = 0.5  # least share of a window's pixels that are readable
 _FLAT_SHARE = 0.7  # least share of those that lie on its plane
-_GROUND_FLAT_MM = 8.0
 _SIDE = 160  # analysed pixels per side
 _MAX_PLANES = 8
 _ROUNDS = 4
@@ -326,17 +344,14 @@ class FlatGround:
     """
 
     floor: Floor
-    patch: NDArray[np.bool_]
+    patch: Mask
     enclosed: float
 
-    def region(self, reach_px: float) -> NDArray[np.bool_]:
+    def region(self, reach_px: float) -> Mask:
         """The ground's convex hull (H, W) bool, extended by `reach_px`."""
         import cv2
 
-        region = np.zeros(self.patch.shape, np.uint8)
-        points = cv2.findNonZero(self.patch.astype(np.uint8))
-        cv2.fillConvexPoly(region, cv2.convexHull(points), 1)
-        away = cv2.distanceTransform(1 - region, cv2.DIST_L2, 5)
+        away = cv2.distanceTransform((~convex_hull(self.patch)).astype(np.uint8), cv2.DIST_L2, 5)
         return np.asarray(away <= reach_px)
 
 
@@ -356,14 +371,9 @@ def flat_grounds(
     step = max(1, max(background.shape) // _SIDE)
     rows, columns = np.mgrid[0 : background.shape[0] : step, 0 : background.shape[1] : step]
     depth = background[::step, ::step].astype(float)
-    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
-    points = np.stack(
-        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(rows.shape)],
-        axis=-1,
-    )
-    read = depth > 0
+    points, middle = _centred(rows, columns, background.shape)
     seeds = _seeds(points, depth, camera.fx / middle[0])
-    left = read.copy()
+    left = depth > 0
     mm2_per_px = step * step / (camera.fx * camera.fy)
     grounds: list[FlatGround] = []
     for _ in range(_MAX_PLANES):
@@ -372,17 +382,13 @@ def flat_grounds(
         some = points[left]
         at = depth[left]
         stride = max(1, len(at) // 4000)
-        votes = _on(some[::stride] @ seeds.T, at[::stride, None], _GROUND_FLAT_MM).sum(axis=0)
+        votes = _on(some[::stride] @ seeds.T, at[::stride, None]).sum(axis=0)
         best = int(np.argmax(votes))
         if votes[best] * stride * float(np.median(at)) ** 2 * mm2_per_px < least_mm2:
             break
-        plane = seeds[best]
-        for _ in range(_ROUNDS):
-            near = _on(some @ plane, at, _GROUND_FLAT_MM)
-            if near.sum() >= 3:
-                plane = _fit(some[near], at[near])
+        plane, _ = _refit(some, at, seeds[best], _ROUNDS)
         grounds += _patches(background, _in_pixels(plane, middle, camera), camera, least_mm2)
-        taken = left & _on(points @ plane, depth, 2.0 * _GROUND_FLAT_MM)
+        taken = left & _on(points @ plane, depth, 2.0 * _INLIER_MM)
         left &= ~taken
         seeds = np.delete(seeds, best, axis=0)
         seeds = seeds[~_same(seeds, plane, points[taken])]
@@ -403,26 +409,12 @@ def _seeds(points: Array, depth: Array, focal: float) -> Array:
             at = depth[window][read]
             kept = np.abs(at - np.median(at)) < 4.0 * np.median(np.abs(at - np.median(at))) + 1.0
             plane = _fit(some[kept], at[kept])
-            if _on(some @ plane, at, _GROUND_FLAT_MM).mean() >= _FLAT_SHARE and plane[2] > 0:
+            if _on(some @ plane, at).mean() >= _FLAT_SHARE and plane[2] > 0:
                 found.append(plane)
-    planes = np.array(found).reshape(-1, 3)
-    steepness = np.hypot(planes[:, 0], planes[:, 1]) * focal / np.maximum(planes[:, 2], 1e-12)
-    return np.asarray(planes[steepness < np.tan(np.radians(_MAX_TILT_DEG))])
+    return _facing(np.array(found).reshape(-1, 3), focal)
 
 
-def _fit(points: Array, depth: Array) -> Array:
-    """The plane (3,) nearest to points (n, 3) at depth (n,) mm, by least squares."""
-    return np.asarray(
-        np.linalg.lstsq(points.T @ points, points.T @ (1.0 / depth), rcond=None)[0], float
-    )
-
-
-def _on(inverse: Array, depth: Array, within_mm: float) -> NDArray[np.bool_]:
-    """Whether points at `depth` lie within `within_mm` of the plane with 1 / z = inverse."""
-    return np.asarray((depth > 0) & (np.abs(depth * inverse - 1.0) < within_mm * inverse))
-
-
-def _same(planes: Array, plane: Array, points: Array) -> NDArray[np.bool_]:
+def _same(planes: Array, plane: Array, points: Array) -> Mask:
     """Which of the planes (n, 3) differ from one by less than the flatness
     tolerance over points.
     """
@@ -430,7 +422,7 @@ def _same(planes: Array, plane: Array, points: Array) -> NDArray[np.bool_]:
         return np.zeros(len(planes), np.bool_)
     some = points[:: max(1, len(points) // 200)]
     depth = 1.0 / np.maximum(some @ plane, 1e-9)
-    return np.asarray(_on(some @ planes.T, depth[:, None], _GROUND_FLAT_MM).mean(axis=0) > 0.9)
+    return np.asarray(_on(some @ planes.T, depth[:, None]).mean(axis=0) > 0.9)
 
 
 def _patches(
@@ -448,59 +440,87 @@ def _patches(
     holes = cv2.morphologyEx(flat.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     whole = flat | ((holes > 0) & (background == 0))
     opened = cv2.morphologyEx(whole.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    n, labels, stats, _ = cv2.connectedComponentsWithStats(opened)
     found = []
-    for k in sorted(range(1, n), key=lambda k: -int(stats[k, cv2.CC_STAT_AREA]))[:_MAX_PLANES]:
-        patch = (labels == k) & flat
+    for part in sorted(parts(opened > 0), key=lambda part: -np.count_nonzero(part))[:_MAX_PLANES]:
+        patch = part & flat
         area = float((background[patch].astype(float) ** 2).sum()) / (camera.fx * camera.fy)
         if area < least_mm2:
             break
         own = _refitted(background, patch, floor, camera)
-        found.append(FlatGround(own, labels == k, _enclosed(background, labels == k, own, camera)))
+        found.append(FlatGround(own, part, _enclosed(background, part, own, camera)))
     return found
 
 
-def _refitted(
-    background: NDArray[np.float32], patch: NDArray[np.bool_], floor: Floor, camera: Camera
-) -> Floor:
+def _refitted(background: NDArray[np.float32], patch: Mask, floor: Floor, camera: Camera) -> Floor:
     """The plane of one patch's own pixels, starting from the whole plane's."""
     rows, columns = np.nonzero(patch)
-    depth = background[rows, columns].astype(float)
-    middle = np.array([background.shape[1] / 2.0, background.shape[0] / 2.0])
-    points = np.stack(
-        [(columns - middle[0]) / middle[0], (rows - middle[1]) / middle[0], np.ones(len(rows))],
-        axis=1,
-    )
+    points, middle = _centred(rows, columns, background.shape)
     a, b, c = floor.inverse_depth
-    plane = np.array([a * middle[0], b * middle[0], c + a * middle[0] + b * middle[1]])
-    for _ in range(_ROUNDS):
-        near = _on(points @ plane, depth, _GROUND_FLAT_MM)
-        if near.sum() < 50:
-            return floor
-        plane = _fit(points[near], depth[near])
-    return _in_pixels(plane, middle, camera)
+    whole = np.array([a * middle[0], b * middle[0], c + a * middle[0] + b * middle[1]])
+    own, share = _refit(points, background[patch].astype(float), whole, _ROUNDS, least=50)
+    return _in_pixels(own, middle, camera) if share > 0 else floor
 
 
-def _enclosed(
-    background: NDArray[np.float32], patch: NDArray[np.bool_], floor: Floor, camera: Camera
-) -> float:
+def _enclosed(background: NDArray[np.float32], patch: Mask, floor: Floor, camera: Camera) -> float:
     """The share of a patch's outline just beyond which something rises above the floor.
 
     Outline along the image border is not enclosed.
     """
     import cv2
 
-    height, width = background.shape
-    hull = np.zeros(patch.shape, np.uint8)
-    outline = cv2.convexHull(cv2.findNonZero(patch.astype(np.uint8)))
-    cv2.fillConvexPoly(hull, outline, 1)
-    reach = 2 * max(_BEYOND_PX, width // 40) + 1
-    a, b, c = floor.inverse_depth
-    v, u = np.mgrid[0:height, 0:width]
-    above = floor.distance_mm * (1.0 - background * (a * u + b * v + c))
-    high = np.where((background > 0) & (hull == 0), above, -1e6).astype(np.float32)
+    hull = convex_hull(patch)
+    reach = 2 * max(_BEYOND_PX, background.shape[1] // 40) + 1
+    v, u = np.mgrid[0 : background.shape[0], 0 : background.shape[1]]
+    above = floor.heights(u, v, background)
+    high = np.where((background > 0) & ~hull, above, -1e6).astype(np.float32)
     highest = cv2.dilate(high, np.ones((reach, reach), np.uint8))
-    ring = (cv2.dilate(hull, np.ones((3, 3), np.uint8)) > 0) & (hull == 0)
-    inside = hull.astype(bool)
-    n_cut = int(inside[0].sum() + inside[-1].sum() + inside[:, 0].sum() + inside[:, -1].sum())
+    ring = (cv2.dilate(hull.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~hull
+    n_cut = int(hull[0].sum() + hull[-1].sum() + hull[:, 0].sum() + hull[:, -1].sum())
     return float((highest[ring] > _RISE_MM).sum()) / max(1, int(ring.sum()) + n_cut)
+
+
+# Masks of pixels: convex hulls and connected components.
+
+
+def convex_hull(mask: Mask) -> Mask:
+    """The pixels of the convex hull of a mask (H, W) bool, which is not empty."""
+    import cv2
+
+    filled = np.zeros(mask.shape, np.uint8)
+    cv2.fillConvexPoly(filled, cv2.convexHull(cv2.findNonZero(mask.astype(np.uint8))), 1)
+    return filled.astype(bool)
+
+
+def components(mask: NDArray[Any]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """The 8-connected components of a mask, numbered as `cv2.connectedComponents` does.
+
+    Only its bounding box is searched.
+
+    Args:
+        mask: (H, W) uint8, nonzero inside.
+
+    Returns:
+        Labels (H, W), 0 outside, 1 and up inside; and (n, 5) left, top, width, height and pixels
+            (`cv2.CC_STAT_*` columns) of each, row 0 is not filled.
+    """
+    import cv2
+
+    left, top, width, height = cv2.boundingRect(mask)
+    # OpenCV numbers components in the order of 2 x 2 blocks, so the box starts at an even pixel
+    box = (slice(top - top % 2, top + height), slice(left - left % 2, left + width))
+    labels = np.zeros(mask.shape, np.int32)
+    if not width:
+        return labels, np.zeros((1, 5), np.int32)
+    _, labels[box], stats, _ = cv2.connectedComponentsWithStats(mask[box])
+    stats[:, cv2.CC_STAT_LEFT] += box[1].start
+    stats[:, cv2.CC_STAT_TOP] += box[0].start
+    stats[0] = 0
+    return labels, np.asarray(stats, np.int32)
+
+
+def parts(mask: Mask, least_px: float = 1) -> Iterator[Mask]:
+    """Yield each connected part (H, W) bool of a mask that has at least `least_px` pixels."""
+    labels, stats = components(mask.astype(np.uint8))
+    for k in range(1, len(stats)):
+        if stats[k, -1] >= least_px:
+            yield labels == k

@@ -31,6 +31,7 @@ from liex_lab.scene.height_maps import (
     Segmenter,
     crop_columns,
     pack_crop_cameras,
+    size_misfit,
     view_of,
 )
 
@@ -38,9 +39,7 @@ Array = NDArray[np.float64]
 
 RANGE_MM = (250.0, 1600.0)  # least and largest depth of a hand
 _FLAT = np.array([0.0, 0.0, 1.0])  # perpendicular to the optical axis
-# standard deviations of the logarithms between postures of one hand
-_AREA_SD = 0.45
-_VOLUME_SD = 0.45
+_SIZE_SD = (0.45, 0.45)  # of the logarithms of area and volume, between postures of one hand
 
 
 @dataclass(frozen=True)
@@ -109,19 +108,8 @@ class HandSegmenter(Segmenter):
         ), sample
 
     def misfit(self, crops: HeightMaps) -> Array:
-        """How unlike the hand each height map (n,) is in size: squared standard deviations.
-
-        The sum of ((log a - log a0) / 0.45)^2 over area and of the same over volume, where the
-        deviations are those between postures of one hand.
-
-        Args:
-            crops: n height maps.
-        """
-        area = np.maximum(crops.blobs.area_mm2, 1.0)
-        volume = np.maximum(crops.blobs.volume_mm3, 1.0)
-        return (np.log(area / self.area_mm2) / _AREA_SD) ** 2 + (
-            np.log(volume / self.volume_mm3) / _VOLUME_SD
-        ) ** 2
+        """See `Segmenter`."""
+        return size_misfit(crops, self.area_mm2, self.volume_mm3, _SIZE_SD)
 
     def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
         """The crop cameras of height maps: intrinsics, T_view_camera, origin and step of each crop.
@@ -165,13 +153,13 @@ class HandSegmenter(Segmenter):
         )
         return self.floor.T_arena_camera @ middle
 
-    def _extract(
+    def extract(
         self,
         depths: NDArray[np.float32],
         size: float,
-        parallel: bool,
-        camera_view: bool,
-        n_candidates: int,
+        parallel: bool = True,
+        camera_view: bool = False,
+        n_candidates: int = 1,
     ) -> HeightMaps:
         """Height maps of the best hands; see `Segmenter`.
 
@@ -193,9 +181,7 @@ class HandSegmenter(Segmenter):
     def every(self, step: int) -> HandSegmenter:
         """The same segmenter for images of every `step`-th row and column."""
         camera = self.camera.every(step)
-        return replace(
-            self, camera=camera, floor=Floor.from_plane(_FLAT, self.floor.distance_mm, camera)
-        )
+        return replace(self, camera=camera, floor=self.floor.for_camera(camera))
 
     def _intrinsics(self, n: int) -> Array:
         c = self.camera

@@ -252,6 +252,24 @@ class HeightMaps:
         return np.stack([blob.x, blob.y, blob.volume_mm3 / blob.area_mm2], axis=1)
 
 
+def size_misfit(
+    crops: HeightMaps, area_mm2: float, volume_mm3: float | None, sd: tuple[float, float]
+) -> Array:
+    """The sum of ((log a - log a0) / sd_a)^2 over area and the same over volume, (n,).
+
+    Args:
+        crops: n height maps.
+        area_mm2: the animal's usual area a0.
+        volume_mm3: its usual volume; None leaves volumes out.
+        sd: of the logarithms of area and of volume, between postures of one animal.
+    """
+    misfit = (np.log(np.maximum(crops.blobs.area_mm2, 1.0) / area_mm2) / sd[0]) ** 2
+    if volume_mm3 is not None:
+        volume = np.maximum(crops.blobs.volume_mm3, 1.0)
+        misfit = misfit + (np.log(volume / volume_mm3) / sd[1]) ** 2
+    return np.asarray(misfit)
+
+
 def moment_columns(moments: Array) -> BlobMoments:
     """The columns of packed moments by name.
 
@@ -389,12 +407,14 @@ class Segmenter(ABC):
     floor: Floor
     area_mm2: float
 
+    @abstractmethod
     def extract(
         self,
         depths: NDArray[np.float32],
         size: float,
         parallel: bool = True,
         camera_view: bool = False,
+        n_candidates: int = 1,
     ) -> HeightMaps:
         """Height maps of the animal in each frame.
 
@@ -404,11 +424,11 @@ class Segmenter(ABC):
             parallel: whether to use all threads.
             camera_view: whether heights are measured along the optical axis, from behind the
                 animal.
+            n_candidates: per frame, 1 or 2.
 
         Returns:
-            One row for each frame.
+            The rows (n) of the best components, then (n_candidates 2) those of the second best.
         """
-        return self._extract(depths, size, parallel, camera_view, 1)
 
     def extract_both(
         self,
@@ -430,7 +450,7 @@ class Segmenter(ABC):
             The best candidates (n rows), and the second best (n rows), found if `n_blobs` is more
             than one.
         """
-        crops = self._extract(depths, size, parallel, camera_view, 2)
+        crops = self.extract(depths, size, parallel, camera_view, 2)
         n = len(depths)
         return crops[:n], crops[n:]
 
@@ -493,25 +513,3 @@ class Segmenter(ABC):
     @abstractmethod
     def every(self, step: int) -> Segmenter:
         """The same segmenter for images of every `step`-th row and column."""
-
-    @abstractmethod
-    def _extract(
-        self,
-        depths: NDArray[np.float32],
-        size: float,
-        parallel: bool,
-        camera_view: bool,
-        n_candidates: int,
-    ) -> HeightMaps:
-        """Height maps of the best component of each frame and, if requested, of the second best.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            size: the animal's spine length over the skeleton's home length.
-            parallel: whether to use all threads.
-            camera_view: whether heights are measured along the optical axis.
-            n_candidates: per frame, 1 or 2.
-
-        Returns:
-            The rows (n) of the best components, then (n_candidates 2) those of the second best.
-        """

@@ -11,21 +11,24 @@ are in view at other times.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, TypeVar
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.scene.floor import parts
 from liex_lab.scene.scene import HIGH_MM, LEAST_MM2, Fixture, fixture_at
 
 if TYPE_CHECKING:
     from liex_lab.scene.background import TargetAnimal
-    from liex_lab.scene.height_maps import HeightMaps
-    from liex_lab.scene.still_scene import StillScene
+    from liex_lab.scene.background_segmenter import BackgroundSubtraction as Scene
 
-
+# the scene with an animal's area, the share of frames that show it, and whether it is like one
+Resting: TypeAlias = "tuple[Scene, float, bool]"
+# an object's first frame, the frame after its last, its pixels and their depth (H, W)
+_Transient: TypeAlias = "tuple[int, int, Mask, Depths]"
 Array = NDArray[np.float64]
 Depths = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -45,9 +48,7 @@ _OFTEN = 0.5  # of the frames
 _ASKED = 16  # frames used for that test
 
 
-def find_transient_objects(
-    scene: StillScene, sample: Depths, times_s: Array
-) -> tuple[Fixture, ...]:
+def find_transient_objects(scene: Scene, sample: Depths, times_s: Array) -> tuple[Fixture, ...]:
     """Find the objects that stand on the floor for a part of the recording, in order of time.
 
     Args:
@@ -62,30 +63,20 @@ def find_transient_objects(
     if n < 2 * _LEAST_FRAMES:
         return ()
     found = []
-    for candidate in _transient_objects(scene, sample):
-        fixture = fixture_at(candidate.mask, candidate.depth, scene.grid_floor, scene.grid)
-        if fixture.area_mm2 < LEAST_MM2 or _is_an_animal(scene, sample, candidate):
+    for start, stop, mask, depth in _transient_objects(scene, sample):
+        fixture = fixture_at(mask, depth, scene.grid_floor, scene.grid)
+        if fixture.area_mm2 < LEAST_MM2 or _is_an_animal(scene, sample, start, stop, mask):
             continue
-        since = float(times_s[candidate.first]) if candidate.first > 0 else None
-        until = float(times_s[candidate.last]) if candidate.last < n else None
+        since = float(times_s[start]) if start > 0 else None
+        until = float(times_s[stop]) if stop < n else None
         found.append(replace(fixture, since_s=since, until_s=until))
     return tuple(sorted(found, key=lambda one: (one.since_s or 0.0, one.until_s or np.inf)))
 
 
-@dataclass(frozen=True)
-class _TransientObject:
-    """Pixels (H, W) of one object from frame `first` to before `last`, at a depth (H, W)."""
-
-    first: int
-    last: int
-    mask: Mask
-    depth: Depths
-
-
-def _transient_objects(scene: StillScene, sample: Depths) -> list[_TransientObject]:
+def _transient_objects(scene: Scene, sample: Depths) -> list[_Transient]:
     """Objects at rest on the floor for one interval of the frames."""
     rows, columns, first, last = _stretches(scene, sample)
-    found: list[_TransientObject] = []
+    found: list[_Transient] = []
     left = np.ones(len(rows), np.bool_)
     while left.sum() >= _LEAST_PX and len(found) < _MOST:
         # the most frequent interval
@@ -93,16 +84,14 @@ def _transient_objects(scene: StillScene, sample: Depths) -> list[_TransientObje
         start, stop = pairs[:, np.argmax(counts)]
         one = left & (np.abs(first - start) <= _ALIKE) & (np.abs(last - stop) <= _ALIKE)
         left &= ~one
-        mask = np.zeros(scene.limit.shape, np.uint8)
-        mask[rows[one], columns[one]] = 1
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
-        for k in range(1, count):
-            if stats[k, cv2.CC_STAT_AREA] >= _LEAST_PX:
-                found += _if_still(sample, labels == k, int(start), int(stop))
+        mask = np.zeros(scene.limit.shape, np.bool_)
+        mask[rows[one], columns[one]] = True
+        for part in parts(mask, _LEAST_PX):
+            found += _if_still(sample, part, int(start), int(stop))
     return found[:_MOST]
 
 
-def _if_still(sample: Depths, mask: Mask, first: int, last: int) -> list[_TransientObject]:
+def _if_still(sample: Depths, mask: Mask, first: int, last: int) -> list[_Transient]:
     """The object in a mask (H, W) if it does not move; its first frames may show the person placing
     it.
     """
@@ -115,17 +104,17 @@ def _if_still(sample: Depths, mask: Mask, first: int, last: int) -> list[_Transi
     depth = np.zeros(mask.shape, np.float32)
     depth[mask] = usual
     until = last if last == len(sample) else first + int(shows[-1]) + 1
-    return [_TransientObject(first + int(shows[0]) if first else 0, until, mask, depth)]
+    return [(first + int(shows[0]) if first else 0, until, mask, depth)]
 
 
-def _is_an_animal(scene: StillScene, sample: Depths, candidate: _TransientObject) -> bool:
+def _is_an_animal(scene: Scene, sample: Depths, first: int, last: int, mask: Mask) -> bool:
     """Whether a candidate is the animal, which covers it in most of the interval, or a second,
     resting animal: then two are in view in most of the other frames.
     """
     rows = np.arange(len(sample))
-    inside = (rows >= candidate.first) & (rows < candidate.last)
+    inside = (rows >= first) & (rows < last)
     own = scene.animal_masks(scene.extract(sample[_some(rows[inside])], 1.0))
-    if own and float(np.mean([one[candidate.mask].mean() > _OWN for one in own])) > _OFTEN:
+    if own and float(np.mean([one[mask].mean() > _OWN for one in own])) > _OFTEN:
         return True
     others = scene.extract(sample[_some(rows[~inside])], 1.0)
     return float((others.n_blobs > 1).mean()) > _OFTEN
@@ -136,7 +125,7 @@ def _some(rows: Rows) -> Rows:
     return rows[np.unique(np.linspace(0, len(rows) - 1, _ASKED).astype(int))]
 
 
-def _stretches(scene: StillScene, sample: Depths) -> tuple[Rows, Rows, Rows, Rows]:
+def _stretches(scene: Scene, sample: Depths) -> tuple[Rows, Rows, Rows, Rows]:
     """Row and column (k,) of the pixels above the floor for one interval of the frames, its first
     frame, and the frame after its last one.
     """
@@ -165,8 +154,6 @@ def _stretches(scene: StillScene, sample: Depths) -> tuple[Rows, Rows, Rows, Row
 # Animals at rest, wholly or in part, that were absorbed into the scene's background.
 
 
-AnyScene = TypeVar("AnyScene", bound="StillScene")
-
 # a lump touched by the animal in this share of the frames is a resting part of it
 _TOUCH_SHARE = 0.9
 _READ = 0.5  # of a lump: it is present if this share is read
@@ -183,26 +170,9 @@ _FREE = 0.75  # least share of a lump's edge that is bare floor; half for the fo
 _AROUND_PX = 4  # width of a lump's edge, which flickers between it and the floor
 
 
-@dataclass(frozen=True)
-class RestingAnimal(Generic[AnyScene]):
-    """An animal found at rest.
-
-    Attributes:
-        scene: the scene with the floor under the animal, so that it is foreground.
-        area_mm2: its usual area, mm^2.
-        share: of the frames that show it, 0 to 1.
-        is_like: whether it resembles an animal, see `is_like_an_animal`.
-    """
-
-    scene: AnyScene
-    area_mm2: float
-    share: float
-    is_like: bool = False
-
-
 def find_resting_animal(
-    scene: AnyScene, sample: Depths, target: TargetAnimal, area: float, share: float
-) -> RestingAnimal[AnyScene] | None:
+    scene: Scene, sample: Depths, target: TargetAnimal, area: float, share: float
+) -> Resting | None:
     """Find an animal that is part of its own background.
 
     This is tried if fewer than half of the frames show something moving, or if what most of them
@@ -216,32 +186,28 @@ def find_resting_animal(
         share: of the frames that show it.
 
     Returns:
-        The animal; None if the scene as learned is better.
+        The scene with the floor under the animal, so that it is foreground, and its area; the share
+            of the frames that show it; and whether it resembles an animal. None if the scene as
+            learned is better.
     """
     moving = replace(scene, area_mm2=area)
     if share >= 0.5 and (not target.stands_on_floor or is_like_an_animal(moving, sample, target)):
         return None
     rests = _changing_lump(scene, sample, target) if target.stands_on_floor else None
     rests = rests or _on_bare_floor(scene, sample, target, 1 if share > 0.0 else _KINDS)
-    if rests.share <= (share if share < 0.5 else 0.0):
+    resting, resting_share, is_like = rests
+    if resting_share <= (share if share < 0.5 else 0.0):
         return None
-    moves = (
-        target.stands_on_floor
-        and area > 0.0
-        and scene.support_plane is not None
-        and scene.support_plane.moves
-    )
-    if (share >= 0.5 or moves) and not rests.is_like:
+    plane_moves = scene.support_plane is not None and scene.support_plane.moves
+    moves = target.stands_on_floor and area > 0.0 and plane_moves
+    if (share >= 0.5 or moves) and not is_like:
         return None
-    resting = replace(rests.scene, area_mm2=rests.area_mm2)
     if share < 0.5 and moves and _is_separate(resting, moving, sample):
         return None
     return rests
 
 
-def with_its_still_part(
-    scene: AnyScene, sample: Depths, target: TargetAnimal, area: float
-) -> tuple[AnyScene, float]:
+def with_its_still_part(scene: Scene, sample: Depths, target: TargetAnimal, area: float) -> Scene:
     """The scene with floor under an animal that was partly absorbed into the background.
 
     The absorbed part is a lump on the floor that the moving animal touches in at least nine tenths
@@ -256,12 +222,12 @@ def with_its_still_part(
         area: area of the moving animal, mm^2.
 
     Returns:
-        The scene, unchanged without such a lump, and the area mm^2 of the whole animal.
+        The scene, and in it the area of the whole animal.
     """
-    crops = replace(scene, area_mm2=area).extract(sample, 1.0)
+    best = replace(scene, area_mm2=area)
+    crops = best.extract(sample, 1.0)
     moving = np.array(scene.animal_masks(crops)).reshape(-1, *scene.limit.shape)
     shown = sample if crops.found.all() else sample[crops.found]
-    best, best_area = scene, area
     for lump in _lumps(scene, target):
         near = _around(lump)
         box = _box(near)
@@ -271,12 +237,12 @@ def with_its_still_part(
             continue
         whole = _with_floor_at(scene, near, target)
         whole_area, share = whole.usual_area(sample, target.spine_mm)
-        if share >= 0.5 and whole_area > best_area:
-            best, best_area = whole, whole_area
-    return best, best_area
+        if share >= 0.5 and whole_area > best.area_mm2:
+            best = replace(whole, area_mm2=whole_area)
+    return best
 
 
-def is_like_an_animal(scene: StillScene, sample: Depths, target: TargetAnimal) -> bool:
+def is_like_an_animal(scene: Scene, sample: Depths, target: TargetAnimal) -> bool:
     """Whether the detection is neither longer than the largest animal nor as low as an uneven
     floor.
 
@@ -285,32 +251,30 @@ def is_like_an_animal(scene: StillScene, sample: Depths, target: TargetAnimal) -
         sample: (n, H, W) float32 mm, frames at its stride.
         target: the expected animal.
     """
-    return _is_like(_shown(scene, sample), scene.area_mm2, target)
+    return _inspected(scene, sample, target)[0]
 
 
-def _shown(scene: StillScene, sample: Depths) -> HeightMaps:
-    """Height maps of the frames of a sample (n, H, W) mm with a detection."""
+def _inspected(scene: Scene, sample: Depths, target: TargetAnimal) -> tuple[bool, bool]:
+    """`is_like_an_animal`, and whether it is in one position in most frames that show it."""
     crops = scene.extract(sample, 1.0)
-    return crops[crops.found]
-
-
-def _is_like(shown: HeightMaps, area_mm2: float, target: TargetAnimal) -> bool:
-    """`is_like_an_animal` for detections of such an area."""
+    shown = crops[crops.found]
     if not len(shown.n_px):
-        return False
+        return False, False
     blobs = shown.blobs
     length = 4.0 * float(np.median(blobs.sd_along))
     height = float(np.median(blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)))
-    return (
+    is_like = (
         length < _LONGEST * target.spine_mm[1]
         and height > _HIGHER * target.min_height_mm
-        and area_mm2 > _LARGER * target.smallest_mm2
+        and scene.area_mm2 > _LARGER * target.smallest_mm2
     )
+    centroid = shown.centroid[:, :2]
+    off = np.linalg.norm(centroid - np.median(centroid, axis=0), axis=1)
+    stays = (off < 0.5 * np.sqrt(scene.area_mm2)).mean() > _IN_PLACE
+    return is_like, bool(stays)
 
 
-def _changing_lump(
-    scene: AnyScene, sample: Depths, target: TargetAnimal
-) -> RestingAnimal[AnyScene] | None:
+def _changing_lump(scene: Scene, sample: Depths, target: TargetAnimal) -> Resting | None:
     """The free lump that resembles an animal, stays in place and changes most; None without one.
 
     An object at rest only flickers along its edge; an animal moves a part of itself. The foot of a
@@ -327,16 +291,13 @@ def _changing_lump(
         own = (areas > target.smallest_mm2) & (areas < target.largest_mm2)
         if own.mean() < 0.5:
             continue
-        area = float(np.median(areas[own]))
-        shown = _shown(replace(whole, area_mm2=area), sample)
-        if _is_like(shown, area, target) and _stays_in_place(shown, area):
-            return RestingAnimal(whole, area, float(own.mean()), is_like=True)
+        whole = replace(whole, area_mm2=float(np.median(areas[own])))
+        if all(_inspected(whole, sample, target)):
+            return whole, float(own.mean()), True
     return None
 
 
-def _on_bare_floor(
-    scene: AnyScene, sample: Depths, target: TargetAnimal, kinds: int
-) -> RestingAnimal[AnyScene]:
+def _on_bare_floor(scene: Scene, sample: Depths, target: TargetAnimal, kinds: int) -> Resting:
     """The component above the floor's bare plane that is in most frames and resembles an animal.
 
     The foot of a wall or a step along the floor's edge is in every frame, too, but longer than any
@@ -346,39 +307,31 @@ def _on_bare_floor(
     on_floor = scene.on_floor if scene.support_plane is None else scene.support_plane.on_floor
     bare = _with_floor_at(scene, on_floor, target)
     tried: list[float] = []
-    first: RestingAnimal[AnyScene] | None = None
+    first = bare, 0.0, False
     while len(tried) < kinds:
         area, share = bare.usual_area(sample, target.spine_mm, tried)
         if share == 0.0:
             break
-        shown = _shown(replace(bare, area_mm2=area), sample)
-        found = RestingAnimal(bare, area, share, _is_like(shown, area, target))
-        if found.is_like and (not tried or _stays_in_place(shown, area)):
-            return found
-        first = first or found
+        resting = replace(bare, area_mm2=area)
+        is_like, stays = _inspected(resting, sample, target)
+        if is_like and (not tried or stays):
+            return resting, share, True
+        first = first if tried else (resting, share, is_like)
         tried.append(area)
-    return first or RestingAnimal(bare, bare.area_mm2, 0.0)
+    return first
 
 
-def _lumps(scene: StillScene, target: TargetAnimal) -> Iterator[Mask]:
+def _lumps(scene: Scene, target: TargetAnimal) -> Iterator[Mask]:
     """The lumps (H, W) bool of the background on the floor."""
-    above = _bare(scene) - scene.background
+    above = scene.bare - scene.background
     raised = scene.on_floor & (scene.background > 0) & (above > target.min_height_mm)
-    n, labels, stats, _ = cv2.connectedComponentsWithStats(raised.astype(np.uint8))
-    for k in range(1, n):
-        if stats[k, cv2.CC_STAT_AREA] >= _LEAST_LUMP_PX:
-            yield labels == k
+    return parts(raised, _LEAST_LUMP_PX)
 
 
-def _free(scene: StillScene, edge: Mask, target: TargetAnimal) -> float:
+def _free(scene: Scene, edge: Mask, target: TargetAnimal) -> float:
     """The share of a lump's edge (H, W) that is bare floor, 0 to 1."""
-    off = np.abs(_bare(scene) - scene.background)[edge]
+    off = np.abs(scene.bare - scene.background)[edge]
     return float((scene.on_floor[edge] & (off < target.min_height_mm)).mean())
-
-
-def _bare(scene: StillScene) -> Depths:
-    """Depth (H, W) mm of the floor's plane."""
-    return scene.grid_floor.depth(scene.grid.width, scene.grid.height)
 
 
 def _around(lump: Mask) -> Mask:
@@ -393,17 +346,18 @@ def _box(mask: Mask) -> tuple[slice, slice]:
     return slice(top, top + height), slice(left, left + width)
 
 
-def _with_floor_at(scene: AnyScene, where: Mask, target: TargetAnimal) -> AnyScene:
+def _with_floor_at(scene: Scene, where: Mask, target: TargetAnimal) -> Scene:
     """The scene with the floor's bare plane as background in some pixels (H, W)."""
-    bare = _bare(scene)
     there = where & scene.on_floor
-    limit = np.where(there, np.maximum(bare - np.float32(target.min_height_mm), 0), scene.limit)
-    background = np.where(there, bare, scene.background)
+    limit = np.where(
+        there, np.maximum(scene.bare - np.float32(target.min_height_mm), 0), scene.limit
+    )
+    background = np.where(there, scene.bare, scene.background)
     return replace(scene, background=background, limit=limit.astype(np.float32))
 
 
 def _areas_at(
-    scene: StillScene, sample: Depths, lump: Mask, target: TargetAnimal
+    scene: Scene, sample: Depths, lump: Mask, target: TargetAnimal
 ) -> NDArray[np.float64]:
     """Area (n,) mm^2 of the foreground that touches a lump (H, W), frame by frame."""
     rows, columns = np.nonzero(lump)
@@ -422,7 +376,7 @@ def _areas_at(
     return areas
 
 
-def _change(scene: StillScene, sample: Depths, near: Mask, target: TargetAnimal) -> float:
+def _change(scene: Scene, sample: Depths, near: Mask, target: TargetAnimal) -> float:
     """Share of the readings in some pixels (H, W) that differ from the background by an animal's
     height.
 
@@ -433,14 +387,7 @@ def _change(scene: StillScene, sample: Depths, near: Mask, target: TargetAnimal)
     return float(np.where(often > 0.1, often, 0.0).mean())
 
 
-def _stays_in_place(shown: HeightMaps, area_mm2: float) -> bool:
-    """Whether detections of such an area are in one position in most frames that show them."""
-    centroid = shown.centroid[:, :2]
-    off = np.linalg.norm(centroid - np.median(centroid, axis=0), axis=1)
-    return bool((off < 0.5 * np.sqrt(area_mm2)).mean() > _IN_PLACE)
-
-
-def _is_separate(resting: StillScene, moving: StillScene, sample: Depths) -> bool:
+def _is_separate(resting: Scene, moving: Scene, sample: Depths) -> bool:
     """Whether the resting object is visible apart from the moving one in a sample (n, H, W)."""
     mover = moving.extract(sample, 1.0)
     both = resting.extract(sample, 1.0)

@@ -12,24 +12,29 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.threads import side_by_side
 from liex_lab.scene.floor import (
     FlatGround,
     Floor,
+    components,
+    convex_hull,
     find_floor,
     fit_plane,
     flat_grounds,
     floor_region,
 )
 from liex_lab.scene.scene import BY_SUPPORT, LARGEST, STATED, WALLED
-from liex_lab.scene.worn import components
+
+if TYPE_CHECKING:
+    from liex_lab.scene.background import SampledScene
 
 Array = NDArray[np.float64]
 
@@ -114,51 +119,12 @@ class MovingObject:
 
     def above(self, floor: Floor) -> float:
         """Median height of the ground around it above a plane, mm."""
-        a, b, c = floor.inverse_depth
-        inverse = a * self.columns + b * self.rows + c
-        return float(np.median(floor.distance_mm * (1.0 - self.depth * inverse)))
-
-    def share_on(self, patch: NDArray[np.bool_]) -> float:
-        """Share of the ground around it that belongs to a patch (H, W) bool."""
-        return float(patch[self.rows, self.columns].mean())
+        return float(np.median(floor.heights(self.columns, self.rows, self.depth)))
 
     def is_on(self, floor: Floor, patch: NDArray[np.bool_]) -> bool:
         """Whether it stands on a patch (H, W) bool of a floor."""
-        return self.stands_on(floor) and self.share_on(patch) > _ON_SHARE
-
-
-@dataclass(frozen=True)
-class SampledScene:
-    """Sampled frames of a recording, their background, and the expected animals.
-
-    Attributes:
-        sample: (n, H, W) float32 mm, the frames, 0 where unread.
-        background: (H, W) float32 mm, 0 where unknown.
-        spread: (H, W) float32 mm, its standard deviation.
-        camera: of these pixels, free of lens distortion.
-        spine_mm: lengths of the smallest and the largest expected animal, mm.
-        min_height_mm: smaller heights above the background are ignored.
-        view: how such animals are viewed.
-    """
-
-    sample: NDArray[np.float32]
-    background: NDArray[np.float32]
-    spread: NDArray[np.float32]
-    camera: Camera
-    spine_mm: tuple[float, float]
-    min_height_mm: float
-    view: CameraView
-
-    @property
-    def areas_mm2(self) -> tuple[float, float]:
-        """Visible areas of the smallest and the largest animal, mm^2."""
-        low, high = self.view.area
-        return low * self.spine_mm[0] ** 2, high * self.spine_mm[1] ** 2
-
-    @property
-    def least_ground_mm2(self) -> float:
-        """Area of the smallest ground that such an animal can stand on, mm^2."""
-        return 4.0 * self.areas_mm2[0]
+        share = float(patch[self.rows, self.columns].mean())
+        return self.stands_on(floor) and share > _ON_SHARE
 
 
 def find_support_plane(scene: SampledScene, stated: Floor | None = None) -> SupportPlane:
@@ -199,8 +165,6 @@ def still_object(
         camera: of these pixels.
         frame: row of the sample.
     """
-    import cv2
-
     own = place.astype(np.uint8)
     outer = np.ones((4 * _AROUND_PX + 1,) * 2, np.uint8)
     inner = np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8)  # the blurred edge is not ground
@@ -211,47 +175,65 @@ def still_object(
 
 
 def find_movers(scene: SampledScene) -> list[MovingObject]:
-    """Moving objects of an animal's size, at most three per frame."""
-    margin = np.maximum(np.float32(scene.min_height_mm), 3.0 * scene.spread)
-    limit = scene.background - margin
-    return _moving(scene.sample, scene.background, limit, scene.camera, scene.areas_mm2)
+    """Moving objects of an animal's size.
+
+    The largest few of each frame, without those much smaller than the usual largest one.
+    """
+    limit = scene.background - np.maximum(
+        np.float32(scene.target.min_height_mm), 3.0 * scene.spread
+    )
+
+    def inspect(frame: int) -> list[MovingObject]:
+        """Objects of one frame, the largest first."""
+        return sorted(_of_frame(scene, frame, limit), key=lambda mover: -mover.volume_mm3)
+
+    found = side_by_side(inspect, range(len(scene.sample)))
+    largest = [movers[0].volume_mm3 for movers in found if movers]
+    least = _SMALLER * float(np.median(largest)) if largest else 0.0
+    return [mover for movers in found for mover in movers[:_A_FRAME] if mover.volume_mm3 >= least]
 
 
 def _choose(scene: SampledScene, movers: list[MovingObject]) -> SupportPlane:
     """The largest plane, or another sufficiently large ground that supports more of the movers."""
-    background = scene.background
-    camera = scene.camera
-    largest = _largest(background, camera, movers)
-    if (
-        isinstance(largest, SupportPlane)
-        and largest.support >= _SUPPORTED
-        and len(movers) >= _MIN_MOVERS
-    ):
+    background, camera = scene.background, scene.camera
+    largest, refusal = None, None
+    try:
+        floor = find_floor(background, camera)
+        on_floor = floor_region(background, floor.depth(camera.width, camera.height))
+        support = _share(movers, [mover.is_on(floor, on_floor) for mover in movers])
+        largest = SupportPlane(floor, on_floor, None, len(movers), support)
+    except EstimationError as error:
+        if camera.distortion is not None or (background > 0).sum() < 500:
+            raise  # no other ground can be found either
+        refusal = error
+    moves = len(movers) >= _MIN_MOVERS
+    if largest is not None and moves and largest.support >= _SUPPORTED:
         return largest
     least_mm2 = scene.least_ground_mm2
-    if len(movers) >= _MIN_MOVERS:  # the flat back of an animal at rest is no ground
+    if moves:  # the flat back of an animal at rest is no ground
         largest_mm2 = float(np.percentile([mover.area_mm2 for mover in movers], 90))
-        usual_mm2 = float(np.sqrt(np.prod(scene.areas_mm2)))  # it may move only its head
+        # it may move only its head
+        usual_mm2 = float(np.sqrt(scene.target.smallest_mm2 * scene.target.largest_mm2))
         least_mm2 = max(least_mm2, _ROOM * max(largest_mm2, usual_mm2))
     grounds = flat_grounds(background, camera, least_mm2)
-    if len(movers) >= _MIN_MOVERS:
-        least = largest.support if isinstance(largest, SupportPlane) else 0.0
-        chosen = _best_supported(grounds, movers, least)
+    if moves:
+        chosen = _best_supported(grounds, movers, largest.support if largest else 0.0)
     else:
-        chosen = _enclosed(grounds, largest.floor if isinstance(largest, SupportPlane) else None)
+        chosen = _enclosed(grounds, largest.floor if largest else None)
     if chosen is not None:
         ground, support, doubt = chosen
         # include animals that lean over the edge
-        reach = scene.spine_mm[1] * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
-        on_floor = ground.region(0.0)
+        reach = scene.target.spine_mm[1] * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
+        on_floor = convex_hull(ground.patch)
         region = ground.region(float(reach))
         origin = WALLED if doubt else BY_SUPPORT
         return SupportPlane(
             ground.floor, on_floor, region, len(movers), support, origin=origin, doubt=doubt
         )
-    if isinstance(largest, EstimationError):
-        raise largest
-    if len(movers) < _MIN_MOVERS:
+    if refusal is not None:
+        raise refusal
+    assert largest is not None
+    if not moves:
         return replace(largest, support=float("nan"))
     doubt = (
         f"only {largest.support:.0%} of the moving objects stand on the detected floor, the "
@@ -275,7 +257,7 @@ def levelled(
     """
     floor = support_plane.floor
     on = [mover for mover in movers if mover.is_on(floor, support_plane.on_floor)]
-    if scene.view.frame != VIEWS[0] or len(on) < _MIN_MOVERS:
+    if not scene.target.stands_on_floor or len(on) < _MIN_MOVERS:
         return support_plane
     step_mm = float(np.median([mover.above(floor) for mover in on]))
     if abs(step_mm) < _STEP_MM:
@@ -316,64 +298,11 @@ def _as_stated(
     return SupportPlane(floor, on_floor, None, len(movers), measured, origin=STATED)
 
 
-def _largest(
-    background: NDArray[np.float32], camera: Camera, movers: list[MovingObject]
-) -> SupportPlane | EstimationError:
-    """The largest plane as the floor, or the error if there is none.
-
-    Raises:
-        EstimationError: no ground can be found in such an image.
-    """
-    try:
-        floor = find_floor(background, camera)
-    except EstimationError as error:
-        if camera.distortion is not None or (background > 0).sum() < 500:
-            raise
-        return error
-    on_floor = floor_region(background, floor.depth(camera.width, camera.height))
-    on = [mover.is_on(floor, on_floor) for mover in movers]
-    return SupportPlane(floor, on_floor, None, len(movers), _share(movers, on))
-
-
-def _moving(
-    sample: NDArray[np.float32],
-    background: NDArray[np.float32],
-    limit: NDArray[np.float32],
-    camera: Camera,
-    areas: tuple[float, float],
-) -> list[MovingObject]:
-    """Objects of an animal's area mm^2 in the frames (n, H, W) that are nearer than the limit (H,
-    W).
-
-    The largest few of each frame, without those much smaller than the usual largest one.
-    """
-
-    def inspect(frame: int) -> list[MovingObject]:
-        """Objects of one frame, the largest first."""
-        movers = _of_frame(sample, frame, background, limit, camera, areas)
-        return sorted(movers, key=lambda mover: -mover.volume_mm3)
-
-    found = []
-    largest = []
-    for movers in side_by_side(inspect, range(len(sample))):
-        found += movers[:_A_FRAME]
-        largest += [mover.volume_mm3 for mover in movers[:1]]
-    least = _SMALLER * float(np.median(largest)) if largest else 0.0
-    return [mover for mover in found if mover.volume_mm3 >= least]
-
-
 def _of_frame(
-    sample: NDArray[np.float32],
-    frame: int,
-    background: NDArray[np.float32],
-    limit: NDArray[np.float32],
-    camera: Camera,
-    areas: tuple[float, float],
+    scene: SampledScene, frame: int, limit: NDArray[np.float32]
 ) -> Iterator[MovingObject]:
-    """All such objects of one frame."""
-    import cv2
-
-    depth = sample[frame]
+    """Objects of an animal's area in one frame that are nearer than the limit (H, W) mm."""
+    depth, background, camera = scene.sample[frame], scene.background, scene.camera
     around = np.ones((2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1), np.uint8)
     square = np.ones((3, 3), np.uint8)
     nearer = ((depth > 0) & (depth < limit)).astype(np.uint8)
@@ -392,18 +321,17 @@ def _of_frame(
         whole = labels[cut] == k
         own = whole & (depth[cut] > 0) & (background[cut] > 0)
         mm2 = depth[cut][own].astype(float) ** 2 / (camera.fx * camera.fy)
-        if not areas[0] < float(mm2.sum()) < areas[1]:
+        if not scene.target.smallest_mm2 < float(mm2.sum()) < scene.target.largest_mm2:
             continue
         rise = (background[cut][own] - depth[cut][own]).astype(float)
         if float(np.median(rise / (background[cut][own] - limit[cut][own]))) < _CLEARLY:
             continue  # noise of distant surfaces rises little, an animal much
         near = (cv2.dilate(whole.astype(np.uint8), around) > 0) & (background[cut] > 0)
         rows, columns = np.nonzero(near)
-        behind = background[cut][near].astype(float)
         yield MovingObject(
             rows + cut[0].start,
             columns + cut[1].start,
-            behind,
+            background[cut][near].astype(float),
             float(mm2.sum()),
             float((mm2 * rise).sum()),
             frame,
@@ -422,14 +350,11 @@ def _best_supported(
     """The ground that supports the most movers, its share of them, and no doubt; None if none is
     clearly better than `least`.
     """
-    best = None
-    most = min(least + _BETTER, _SUPPORTED)
+    best, most = None, min(least + _BETTER, _SUPPORTED)
     for ground in grounds:
-        on = [mover.is_on(ground.floor, ground.patch) for mover in movers]
-        share = _share(movers, on)
+        share = _share(movers, [mover.is_on(ground.floor, ground.patch) for mover in movers])
         if share > most:
-            best = ground
-            most = share
+            best, most = ground, share
     return None if best is None else (best, most, "")
 
 
@@ -440,7 +365,9 @@ def _enclosed(
     for ground in sorted(grounds, key=lambda ground: -int(ground.patch.sum())):
         if ground.enclosed < _ENCLOSED:
             continue
-        if largest is not None and not _is_raised(ground, largest):
+        rows, columns = np.nonzero(ground.patch)
+        depth = 1.0 / np.maximum(ground.floor.inverse_at(columns, rows), 1e-9)
+        if largest is not None and (np.median(largest.heights(columns, rows, depth)) <= _RAISED_MM):
             return None  # walls enclose the largest plane itself
         doubt = (
             "no object of an animal's size moved, so the largest walled ground is used as the "
@@ -450,11 +377,94 @@ def _enclosed(
     return None
 
 
-def _is_raised(ground: FlatGround, floor: Floor) -> bool:
-    """Whether a ground lies clearly above a plane."""
-    rows, columns = np.nonzero(ground.patch)
-    a, b, c = floor.inverse_depth
-    own = ground.floor.inverse_depth
-    depth = 1.0 / np.maximum(own[0] * columns + own[1] * rows + own[2], 1e-9)
-    above = floor.distance_mm * (1.0 - depth * (a * columns + b * rows + c))
-    return bool(np.median(above) > _RAISED_MM)
+# Multiple arenas in one image: separates the grounds on which different animals move.
+
+
+_MOST = 8
+_LEAST_MOVERS = 3  # moving objects on a ground
+_ALIKE = 2.0  # largest ratio of areas for a ground without movement
+_APART_PX = 2.0  # between two regions at least
+_SMOOTH_PX = 1.5  # by which a polygon may leave its region
+
+
+def arenas_apart(scene: SampledScene) -> list[list[tuple[int, int]]]:
+    """The outlines of multiple arenas.
+
+    Args:
+        scene: sampled frames and their background.
+
+    Returns:
+        (u, v) corners of each, pixels of the scene's camera, row by row from the top left; [] for
+        fewer than two or more than eight.
+    """
+    camera = scene.camera
+    movers = find_movers(scene)
+    supporting: list[FlatGround] = []
+    others: list[FlatGround] = []
+    for ground in flat_grounds(scene.background, camera, scene.least_ground_mm2):
+        n = sum(mover.is_on(ground.floor, ground.patch) for mover in movers)
+        (supporting if n >= _LEAST_MOVERS else others).append(ground)
+    supporting = _one_each(supporting)
+    if supporting:
+        usual = float(np.median([ground.patch.sum() for ground in supporting]))
+        asleep = [
+            ground
+            for ground in others
+            if ground.enclosed >= _ENCLOSED and usual / _ALIKE < ground.patch.sum() < usual * _ALIKE
+        ]
+        supporting = _one_each([*supporting, *asleep])
+    if not 2 <= len(supporting) <= _MOST:
+        return []
+    reach = [
+        scene.target.spine_mm[1] * float(np.sqrt(camera.fx * camera.fy)) / ground.floor.distance_mm
+        for ground in supporting
+    ]
+    return _outlines(supporting, reach)
+
+
+def _one_each(grounds: list[FlatGround]) -> list[FlatGround]:
+    """The grounds, without those that overlap the hull of an earlier one."""
+    kept: list[FlatGround] = []
+    for ground in grounds:
+        rows, columns = np.nonzero(ground.patch)
+        middle = (int(np.median(rows)), int(np.median(columns)))
+        hull = convex_hull(ground.patch)
+        others = [convex_hull(one.patch) for one in kept]
+        if not any(other[middle] or (hull & other).sum() > 0.2 * hull.sum() for other in others):
+            kept.append(ground)
+    return kept
+
+
+def _outlines(grounds: list[FlatGround], reach_px: list[float]) -> list[list[tuple[int, int]]]:
+    """The polygons of the Voronoi cells around the grounds, within the reach of each, px."""
+    away = np.stack(
+        [
+            cv2.distanceTransform(1 - convex_hull(ground.patch).astype(np.uint8), cv2.DIST_L2, 5)
+            for ground in grounds
+        ]
+    )
+    found = []
+    for k, reach in enumerate(reach_px):
+        nearest_other = np.delete(away, k, axis=0).min(axis=0)
+        margin = _APART_PX + 2.0 * _SMOOTH_PX
+        cell = ((away[k] <= reach) & (away[k] + margin < nearest_other)).astype(np.uint8)
+        outlines, _ = cv2.findContours(cell, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        largest = max(outlines, key=cv2.contourArea)
+        corners = cv2.approxPolyDP(largest, _SMOOTH_PX, True)[:, 0]
+        found.append([(int(u), int(v)) for u, v in corners])
+    return _in_reading_order(found)
+
+
+def _in_reading_order(outlines: list[list[tuple[int, int]]]) -> list[list[tuple[int, int]]]:
+    """Row by row from the top, within a row from the left."""
+    middles = [np.mean(corners, axis=0) for corners in outlines]
+    heights = [np.ptp(np.array(corners)[:, 1]) for corners in outlines]
+    row_px = 0.5 * float(np.median(heights)) if heights else 1.0
+    order = sorted(range(len(outlines)), key=lambda k: float(middles[k][1]))
+    rows: list[list[int]] = []
+    for k in order:
+        if rows and middles[k][1] - middles[rows[-1][0]][1] < row_px:
+            rows[-1].append(k)
+        else:
+            rows.append([k])
+    return [outlines[k] for row in rows for k in sorted(row, key=lambda k: float(middles[k][0]))]

@@ -2,109 +2,143 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import side_by_side
-from liex_lab.scene.floor import Floor
+from liex_lab.scene.floor import Floor, components
+
+if TYPE_CHECKING:
+    from liex_lab.scene.background import TargetAnimal
+
+Depths = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+_SQUARE = np.ones((3, 3), np.uint8)
+
+
+def find_worn(
+    sample: Depths, limit: Depths, floor: Floor, camera: Camera, target: TargetAnimal
+) -> tuple[tuple[Worn, ...], Depths]:
+    """The devices that an animal wears, in the order of their removal, and the sample without them.
+
+    Args:
+        sample: (n, H, W) float32 mm, frames spread over a recording, 0 where unread.
+        limit: (H, W) float32 mm; a reading below it is foreground.
+        floor: the floor in these pixels.
+        camera: of these pixels.
+        target: the animal.
+    """
+    found: list[Worn] = []
+    cable = Cable.find(sample, limit, camera, floor, target.spine_mm[1], target.smallest_mm2)
+    if cable is not None:
+        whole, sample = sample, cable.cut(sample, limit)
+        found.append(cable.with_fixed(whole, sample))
+    stage = HeadStage.find(sample, limit, camera, floor, target.smallest_mm2)
+    if stage is not None:
+        sample = stage.cut(sample, limit)
+        found.append(stage)
+    return tuple(found), sample
 
 
 @dataclass(frozen=True)
-class Worn:
+class Worn(ABC):
     """How a worn device is separated from the animal in one camera's images.
 
     Attributes:
         camera: of the analysed pixels.
         floor: the floor in pixels of that camera.
+        wide_mm: a body is wider, the device is not.
+        remark: what was corrected, as a sentence.
     """
 
     camera: Camera
     floor: Floor
+    wide_mm: ClassVar[float]
+    remark: ClassVar[str]
+
+    def cut(self, depths: Depths, limit: Depths) -> Depths:
+        """The frames without the device.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            limit: (H, W) float32 mm; a reading below it is foreground.
+
+        Returns:
+            (n, H, W) float32 mm, a copy; its pixels are 0, or the animal beneath interpolated from
+            the body around it.
+        """
+        check_shapes("frames", ("depths", depths, ("n", *limit.shape)))
+        out = depths.copy()
+        for depth in out:
+            self._cut_one(depth, self._heights(depth, limit))
+        return out
+
+    def worn(self, depths: Depths, limit: Depths) -> Mask:
+        """Pixels (n, H, W) to clear in frames that are shown; see `cut` for the arguments."""
+        return np.zeros(depths.shape, np.bool_)
 
     def every(self, step: int) -> Self:
         """The same for every `step`-th row and column of the image."""
         camera = self.camera.every(step)
-        floor = Floor.from_plane(self.floor.normal, self.floor.distance_mm, camera)
-        return replace(self, camera=camera, floor=floor)
+        return replace(self, camera=camera, floor=self.floor.for_camera(camera))
+
+    @abstractmethod
+    def _cut_one(self, depth: Depths, height: Depths) -> None:
+        """Remove the device from an image (H, W), in place, whose heights (H, W) mm are given."""
 
     @property
     def _px_mm(self) -> float:
         """Width of a pixel on the floor, mm."""
         return self.floor.distance_mm / float(np.sqrt(self.camera.fx * self.camera.fy))
 
+    @property
+    def _side(self) -> int:
+        """Width in pixels, odd, of the smallest square that no such device fills."""
+        return max(3, int(self.wide_mm / self._px_mm + 0.5) | 1)
 
-# Heights of the foreground above the floor.
+    @cached_property
+    def _inverse(self) -> NDArray[np.float64]:
+        """(H, W) 1 / mm, of the floor's depth under every pixel."""
+        rows, columns = np.mgrid[: self.camera.height, : self.camera.width]
+        return self.floor.inverse_at(columns, rows)
 
+    def _heights(self, depth: Depths, limit: Depths) -> Depths:
+        """Heights (H, W) mm above the floor of an image's foreground, 0 for background."""
+        near = (depth > 0) & (depth < limit)
+        height = np.zeros(depth.shape, np.float32)
+        above = self.floor.distance_mm * (1.0 - depth[near] * self._inverse[near])
+        height[near] = np.maximum(above, 0.0)
+        return height
 
-Depths = NDArray[np.float32]
+    def _wide(self, height: NDArray[Any]) -> Depths:
+        """Heights (H, W) of the parts that are wider than the device."""
+        # a one-pixel hole does not split a body
+        closed = cv2.morphologyEx(height, cv2.MORPH_CLOSE, _SQUARE)
+        side = np.ones((self._side,) * 2, np.uint8)
+        return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, side), np.float32)
 
-
-def heights_before(depth: Depths, limit: Depths, floor: Floor) -> Depths:
-    """Heights of readings nearer than the background's limit.
-
-    Args:
-        depth: (H, W) float32 mm, 0 where unread.
-        limit: (H, W) float32 mm; a reading below it is foreground.
-        floor: the floor in image pixels.
-
-    Returns:
-        (H, W) float32 mm above the floor's plane, 0 for background.
-    """
-    a, b, c = floor.inverse_depth
-    rows, columns = np.nonzero((depth > 0) & (depth < limit))
-    height = np.zeros(depth.shape, np.float32)
-    inverse = a * columns + b * rows + c
-    above = floor.distance_mm * (1.0 - depth[rows, columns] * inverse)
-    height[rows, columns] = np.maximum(above, 0.0)
-    return height
-
-
-# Connected components of a mask, searched in its bounding box.
-
-
-class Components(NamedTuple):
-    """Connected components (8-connected) of a mask, in the order of `cv2.connectedComponents`.
-
-    Attributes:
-        labels: (H, W) int32, 0 outside, 1 and up inside.
-        stats: (n, 5) int32, row k of component k: left, top, width, height, pixels (`cv2.CC_STAT_*`
-            columns); row 0 is not filled.
-    """
-
-    labels: NDArray[np.int32]
-    stats: NDArray[np.int32]
-
-
-def components(mask: NDArray[np.uint8]) -> Components:
-    """The connected components of a mask (H, W) uint8, nonzero inside."""
-    import cv2
-
-    left, top, width, height = cv2.boundingRect(mask)
-    # OpenCV numbers components in the order of 2 x 2 blocks, so the box starts at an even pixel
-    box = (slice(top - top % 2, top + height), slice(left - left % 2, left + width))
-    labels = np.zeros(mask.shape, np.int32)
-    if not width:
-        return Components(labels, np.zeros((1, 5), np.int32))
-    _, labels[box], stats, _ = cv2.connectedComponentsWithStats(mask[box])
-    stats[:, cv2.CC_STAT_LEFT] += box[1].start
-    stats[:, cv2.CC_STAT_TOP] += box[0].start
-    stats[0] = 0
-    return Components(labels, np.asarray(stats, np.int32))
+    def _replace(self, depth: Depths, height: Depths, worn: Mask, most_mm: float = np.inf) -> None:
+        """Replace pixels of an image by the animal beneath, at most `most_mm` high, in place."""
+        over = np.ones((2 * self._side + 1,) * 2, np.uint8)
+        under = cv2.morphologyEx(np.where(worn, np.float32(0), height), cv2.MORPH_CLOSE, over)
+        under = np.minimum(under, np.float32(most_mm))
+        filled = worn & (under > 0) & (self._inverse > 0)
+        depth[worn] = 0.0
+        depth[filled] = (1.0 - under[filled] / self.floor.distance_mm) / self._inverse[filled]
 
 
 # Head stages: blocks cemented to the skull, which protrude from the animal on all sides.
 
 
-Mask = NDArray[np.bool_]
-
-_WIDE_MM = 13.0  # a body is wider
 _NARROW_MM = 5.0  # least height of a narrow part above the wide one
 _STEP_MM = 6.0  # and above the surrounding body
 _AREA_MM2 = (30.0, 260.0)  # seen from above
@@ -120,12 +154,12 @@ class HeadStage(Worn):
     """How a head stage is separated from the animal in one camera's images.
 
     Attributes:
-        camera: see `Worn`.
-        floor: see `Worn`.
         area_mm2: its usual area seen from above, mm^2.
     """
 
     area_mm2: float
+    wide_mm = 13.0
+    remark = "a head stage on the animal was removed from the images"
 
     @staticmethod
     def find(
@@ -144,7 +178,7 @@ class HeadStage(Worn):
 
         def inspect(depth: Depths) -> tuple[bool, list[float]]:
             """Whether a frame shows something as large as an animal, and its blocks' areas, px."""
-            height = heights_before(depth, limit, floor)
+            height = largest._heights(depth, limit)
             shows = bool(np.count_nonzero(height) * largest._px_mm**2 > area_mm2)
             return shows, [float(block.sum()) for block, _ in largest._blocks(height)]
 
@@ -154,36 +188,10 @@ class HeadStage(Worn):
             return None
         return replace(largest, area_mm2=float(np.median(worn)) * largest._px_mm**2)
 
-    def cut(self, depths: Depths, limit: Depths) -> Depths:
-        """The frames without it.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is foreground.
-
-        Returns:
-            (n, H, W) float32 mm, a copy; the head under the device is interpolated from the body
-            around it.
-        """
-        check_shapes("frames", ("depths", depths, ("n", *limit.shape)))
-        out = depths.copy()
-        for depth in out:
-            height = heights_before(depth, limit, self.floor)
-            for block, around in self._blocks(height):
-                self._cut_one(depth, height, block, around)
-        return out
-
-    @property
-    def _side(self) -> int:
-        """Width in pixels, odd, of the smallest square that no head stage fills."""
-        return max(3, int(_WIDE_MM / self._px_mm + 0.5) | 1)
-
     def _blocks(self, height: Depths) -> Iterator[tuple[Mask, float]]:
         """The blocks (H, W) bool of an image's heights (H, W) mm that protrude on all sides, and
         the height of the body around each, mm.
         """
-        import cv2
-
         rows, columns = (np.flatnonzero((height != 0).any(axis=axis)) for axis in (1, 0))
         if not len(rows):
             return
@@ -194,9 +202,8 @@ class HeadStage(Worn):
         )
         # single readings are noise, and a one-pixel hole does not split a body
         smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(height[cut]), 3))
-        closed = cv2.morphologyEx(smooth, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        wide = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((self._side,) * 2, np.uint8))
-        labels, stats = components(((smooth - wide > _NARROW_MM) & (smooth > 0)).astype(np.uint8))
+        narrow = (smooth - self._wide(smooth) > _NARROW_MM) & (smooth > 0)
+        labels, stats = components(narrow.astype(np.uint8))
         least, most = (value / self._px_mm**2 for value in _AREA_MM2)
         most = min(most, _TIMES_AREA * self.area_mm2 / self._px_mm**2)
         beside = np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)
@@ -216,30 +223,16 @@ class HeadStage(Worn):
                 out[cut] = block
                 yield out, around
 
-    def _cut_one(self, depth: Depths, height: Depths, block: Mask, around: float) -> None:
-        """Remove a block from an image (H, W) mm, in place, and fill in the head beneath."""
-        import cv2
-
-        # the readings beside it are of both
-        worn = (cv2.dilate(block.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & (
-            block | (height > around)
-        )
-        kept = np.where(worn, np.float32(0), height)
-        over = np.ones((2 * self._side + 1,) * 2, np.uint8)
-        under = np.minimum(cv2.morphologyEx(kept, cv2.MORPH_CLOSE, over), np.float32(around))
-        a, b, c = self.floor.inverse_depth
-        rows, columns = np.nonzero(worn)
-        inverse = a * columns + b * rows + c
-        filled = under[worn]
-        depth[worn] = np.where(
-            filled > 0, (1.0 - filled / self.floor.distance_mm) / inverse, 0.0
-        ).astype(np.float32)
+    def _cut_one(self, depth: Depths, height: Depths) -> None:
+        for block, around in self._blocks(height):
+            # the readings beside it are of both
+            worn = cv2.dilate(block.astype(np.uint8), _SQUARE) > 0
+            self._replace(depth, height, worn & (block | (height > around)), around)
 
 
 # Cables and fibres: thin objects that rise from the animal beyond its own reach.
 
 
-_CABLE_WIDE_MM = 10.0  # a body is wider, a cable with its blurred edges is not
 _RISE_MM = 6.0  # least height of a cable above its surroundings
 _TALLER = 1.2  # in lengths of the largest animal: beyond its reach
 _BACK = 95.0  # %: quantile of the wide parts' heights that is the back
@@ -257,8 +250,6 @@ class Cable(Worn):
     """How cables are separated from the animal in one camera's images.
 
     Attributes:
-        camera: see `Worn`.
-        floor: see `Worn`.
         tall_mm: no animal reaches higher above the floor.
         fixed: (H, W) bool, thin parts of the arena itself above the floor, such as a lid's bars;
             None if unknown.
@@ -266,6 +257,8 @@ class Cable(Worn):
 
     tall_mm: float
     fixed: Mask | None = None
+    wide_mm = 10.0
+    remark = "something thin above the animal, a cable or bars, was removed from the images"
 
     @staticmethod
     def find(
@@ -297,23 +290,6 @@ class Cable(Worn):
         with_one = [leads for leads in found if leads is not None]
         return cable if with_one and np.mean(with_one) >= _CABLE_LEAST_SHARE else None
 
-    def cut(self, depths: Depths, limit: Depths) -> Depths:
-        """The frames without cables.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is foreground.
-
-        Returns:
-            (n, H, W) float32 mm, a copy; cable pixels are 0, or the back beneath interpolated from
-            the body around it.
-        """
-        check_shapes("frames", ("depths", depths, ("n", *limit.shape)))
-        out = depths.copy()
-        for depth in out:
-            self._cut_one(depth, limit)
-        return out
-
     def with_fixed(self, sample: Depths, cut: Depths) -> Cable:
         """The same with the thin parts of the arena itself.
 
@@ -324,11 +300,7 @@ class Cable(Worn):
         Returns:
             A cable whose `fixed` marks the pixels that were cut in most frames.
         """
-        import cv2
-
-        share = np.mean(
-            [before != after for before, after in zip(sample, cut, strict=True)], axis=0
-        )
+        share = np.mean([a != b for a, b in zip(sample, cut, strict=True)], axis=0)
         edge = np.ones((2 * _FIXED_EDGE_PX + 1,) * 2, np.uint8)
         return replace(self, fixed=cv2.dilate((share > _FIXED).astype(np.uint8), edge) > 0)
 
@@ -338,26 +310,9 @@ class Cable(Worn):
         return replace(super().every(step), fixed=fixed)
 
     def worn(self, depths: Depths, limit: Depths) -> Mask:
-        """Pixels (n, H, W) of worn cables, without parts of the arena.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            limit: (H, W) float32 mm; a reading below it is foreground.
-        """
+        """Pixels (n, H, W) of worn cables, without parts of the arena; see `cut`."""
         worn = self.cut(depths, limit) != depths
         return np.asarray(worn if self.fixed is None else worn & ~self.fixed)
-
-    @cached_property
-    def _inverse(self) -> NDArray[np.float64]:
-        """(H, W) 1 / mm, of the floor's depth under every pixel."""
-        a, b, c = self.floor.inverse_depth
-        rows, columns = np.mgrid[: self.camera.height, : self.camera.width]
-        return np.asarray(a * columns + b * rows + c)
-
-    @property
-    def _side(self) -> int:
-        """Width in pixels, odd, of the smallest square that no cable fills."""
-        return max(3, int(_CABLE_WIDE_MM / self._px_mm + 0.5) | 1)
 
     def _rises(self, sample: Depths, limit: Depths) -> bool:
         """Whether anything in a sample (n, H, W) may reach higher than an animal."""
@@ -367,51 +322,24 @@ class Cable(Worn):
         nearer = np.minimum(above, limit).astype(np.float32)
         return any(bool(((depth > 0) & (depth < nearer)).any()) for depth in sample)
 
-    def _heights(self, depth: Depths, limit: Depths) -> tuple[Depths, Depths]:
-        """Heights (H, W) mm of the foreground of an image, and of its wide parts."""
-        import cv2
-
-        above = self.floor.distance_mm * (1.0 - depth * self._inverse)
-        near = (depth > 0) & (depth < limit)
-        height = np.where(near, np.maximum(above, 0.0), 0.0).astype(np.float32)
-        # a one-pixel hole does not split a body
-        closed = cv2.morphologyEx(height, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        wide = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((self._side,) * 2, np.uint8))
-        return height, np.asarray(wide, np.float32)
-
-    def _cut_one(self, depth: Depths, limit: Depths) -> None:
-        """Remove cables from an image (H, W), in place, and fill in what they cover."""
-        import cv2
-
-        height, wide = self._heights(depth, limit)
+    def _cut_one(self, depth: Depths, height: Depths) -> None:
+        wide = self._wide(height)
         body = wide[(wide > 0) & (wide < self.tall_mm)]
         back = float(np.percentile(body, _BACK)) if len(body) else 0.0
         worn = np.zeros(depth.shape, np.bool_)
         for part in self._parts(height, wide):
             # a snout is as narrow as a cable, but no higher than the back
             worn |= part & ((wide > 0) | (height > back))
-        if not worn.any():
-            return
-        # the readings beside it are of both
-        worn = cv2.dilate(worn.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        kept = np.where(worn, np.float32(0), height)
-        over = np.ones((2 * self._side + 1,) * 2, np.uint8)
-        under = cv2.morphologyEx(kept, cv2.MORPH_CLOSE, over)
-        filled = worn & (under > 0) & (self._inverse > 0)
-        depth[worn] = 0.0
-        depth[filled] = (1.0 - under[filled] / self.floor.distance_mm) / self._inverse[filled]
+        if worn.any():  # the readings beside it are of both
+            self._replace(depth, height, cv2.dilate(worn.astype(np.uint8), _SQUARE) > 0)
 
     def _parts(self, height: Depths, wide: Depths) -> Iterator[Mask]:
         """The cables of an image, one at a time."""
-        import cv2
-
         thin = (height - wide > _RISE_MM) | (height > self.tall_mm)
         if not (height > self.tall_mm).any():
             return
         reach = np.ones((2 * _LINK_PX + 1, 2 * _LINK_PX + 1), np.uint8)
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(
-            cv2.dilate(thin.astype(np.uint8), reach)
-        )
+        labels, stats = components(cv2.dilate(thin.astype(np.uint8), reach))
         tall = np.unique(labels[thin & (height > self.tall_mm)])
         for k in tall[tall > 0]:
             run = max(stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT])
@@ -420,11 +348,9 @@ class Cable(Worn):
 
     def _leads_to_one(self, depth: Depths, limit: Depths, least_px: float) -> bool | None:
         """Whether a cable leads to something wide of an animal's size; None without such a body."""
-        import cv2
-
-        height, wide = self._heights(depth, limit)
-        body = ((wide > 0) & (wide < self.tall_mm)).astype(np.uint8)
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(body)
+        height = self._heights(depth, limit)
+        wide = self._wide(height)
+        labels, stats = components(((wide > 0) & (wide < self.tall_mm)).astype(np.uint8))
         large = 1 + np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= least_px)
         if not len(large):
             return None

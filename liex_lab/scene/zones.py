@@ -1,8 +1,12 @@
-"""Zones of the arena drawn by the user: named circles and polygons on the floor, from TOML.
+"""Regions and zones drawn by the user: the arena's region in the image, and zones on the floor.
 
-A point is inside a polygon by the even-odd rule: the number of sides that a ray along x crosses.
-Zones may be drawn in pixels; the view rays of their outline are intersected with the floor, 1 / z =
-a u + b v + c.
+A region is a polygon, rectangle or circle of a plan, in pixels or in millimetres of the arena
+frame: x along image rows and y up the image. Corners in millimetres are projected from the floor
+into the image. Overlapping arenas are refused.
+
+Zones are named circles and polygons from TOML. A point is inside a polygon by the even-odd rule:
+the number of sides that a ray along x crosses. Zones may be drawn in pixels; the view rays of their
+outline are intersected with the floor, 1 / z = a u + b v + c.
 """
 
 from __future__ import annotations
@@ -10,8 +14,9 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +25,126 @@ from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
+from liex_lab.plan.sections import Region
+from liex_lab.recordings.frame import region_mask
 from liex_lab.runtime.text_files import read_toml
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.outline import Arena, circle_points
-from liex_lab.scene.region import crossing_sides
+from liex_lab.scene.scene import Arena, Mask, circle_points
 
 Array = NDArray[np.float64]
+Corners = tuple[tuple[float, float], ...]
+
+
+def crossing_sides(corners: Array) -> tuple[int, int] | None:
+    """The first two sides of a polygon that cross inside both, counted from 0.
+
+    Two segments cross if each separates the ends of the other.
+
+    Args:
+        corners: (n, 2), in order; side k connects corner k to the next.
+
+    Returns:
+        Their numbers, the smaller first; None if no sides cross.
+    """
+    ends = np.roll(corners, -1, axis=0)
+    n = len(corners)
+    for i in range(n - 2):
+        others = slice(i + 2, n - (i == 0))
+        a, b, c, d = corners[i], ends[i], corners[others], ends[others]
+        crossing = (_side(a, b, c) * _side(a, b, d) < 0) & (_side(c, d, a) * _side(c, d, b) < 0)
+        if crossing.any():
+            return i, i + 2 + int(np.argmax(crossing))
+    return None
+
+
+def _side(p: Array, q: Array, r: Array) -> Array:
+    """Twice the signed area of triangles p, q, r, any of them (..., 2)."""
+    return np.asarray(
+        (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1])
+        - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+    )
+
+
+_N_CORNERS = 64  # of a circle
+_DEEPEST_SHARE = 1e-3  # least depth of a corner, as a share of the floor's distance
+
+
+def region_corners_px(
+    region: Region, camera: Camera | None = None, floor: Floor | None = None
+) -> Corners:
+    """The corners of a region in the image.
+
+    Args:
+        region: as stated in a plan.
+        camera: the ideal pinhole camera of the recording; needed for millimetres only.
+        floor: likewise.
+
+    Returns:
+        (u, v) pixels.
+
+    Raises:
+        PlanError: sides of its polygon cross, or a corner in millimetres lies behind the camera.
+    """
+    corners = _drawn(region)
+    if (crossing := crossing_sides(corners)) is not None:
+        raise PlanError(
+            f"arena.region: sides {crossing[0] + 1} and {crossing[1] + 1} of its polygon cross; "
+            "list the corners in order around the arena"
+        )
+    if region.unit == "px":
+        return tuple((float(u), float(v)) for u, v in corners)
+    if camera is None or floor is None:
+        raise PlanError("a region in mm needs a floor; state it in pixels, or state arena.floor")
+    on_floor = np.column_stack([corners, np.zeros(len(corners))])
+    points = floor.T_arena_camera.inverse() @ on_floor
+    if (points[:, 2] < _DEEPEST_SHARE * floor.distance_mm).any():
+        raise PlanError(
+            "arena.region has corners that lie behind the camera; millimetres are measured from "
+            "the point of the floor below the camera"
+        )
+    return tuple((float(u), float(v)) for u, v in camera.project(points))
+
+
+def _drawn(region: Region) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """The corners (n, 2) in the region's own unit."""
+    if region.circle is not None:
+        return np.array(region.circle.centre) + region.circle.radius * circle_points(_N_CORNERS)
+    if region.rectangle is not None:
+        (x0, y0), (x1, y1) = region.rectangle
+        return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float)
+    return np.array(region.polygon, float).reshape(-1, 2)
+
+
+def masks_apart(regions: Mapping[str, Corners], width: int, height: int) -> dict[str, Mask]:
+    """The disjoint pixel masks of multiple arenas.
+
+    Args:
+        regions: (u, v) corners, pixels, by the arena's name.
+        width: of the image, px.
+        height: of the image, px.
+
+    Returns:
+        (height, width) bool by the arena's name.
+
+    Raises:
+        PlanError: a region is no polygon in the image, or two overlap.
+    """
+    masks = {}
+    for name, corners in regions.items():
+        try:
+            masks[name] = region_mask(corners, width, height)
+        except PlanError as error:
+            raise PlanError(f"the arena {name}: {error}") from None
+    for one, other in combinations(masks, 2):
+        if n := int((masks[one] & masks[other]).sum()):
+            raise PlanError(
+                f"the arenas {one} and {other} overlap in {n} pixels, and an animal there would be "
+                "in both; move their regions apart"
+            )
+    return masks
+
+
+# Zones on the floor.
 
 SEPARATOR = ";"  # between the names of zones that overlap, in tables
 _KEYS = ("name", "circle", "polygon", "unit", "relative_to")
@@ -161,8 +280,7 @@ class DrawnZone:
 
     def _on_floor(self, uv: Array, camera: Camera, floor: Floor) -> Array:
         """Intersections (n, 2) mm of the view rays of pixels (n, 2) with the floor."""
-        a, b, c = floor.inverse_depth
-        inverse = a * uv[:, 0] + b * uv[:, 1] + c
+        inverse = floor.inverse_at(uv[:, 0], uv[:, 1])
         if not (inverse > 0).all():
             raise PlanError(
                 f"{self.where} reaches above the horizon of the floor; draw it on the floor"
@@ -198,11 +316,11 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
         raise PlanError(
             f"{file} should be a TOML file with zones, but it is not ({error}); correct it"
         ) from None
-    entries = table.get("zones")
-    if not isinstance(entries, list) or not entries or set(table) != {"zones"}:
-        raise PlanError(
-            f"{file} should contain only zones, each beginning with [[zones]]; as in {_EXAMPLE}"
-        )
+    entries: Any = table.get("zones")
+    _require(
+        isinstance(entries, list) and entries and set(table) == {"zones"},
+        f"{file} should contain only zones, each beginning with [[zones]]; as in {_EXAMPLE}",
+    )
     zones = [_zone(file, number, entry) for number, entry in enumerate(entries, start=1)]
     names = [zone.name for zone in zones]
     if double := next((name for name in names if names.count(name) > 1), None):
@@ -210,60 +328,69 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     return tuple(zones)
 
 
+def _require(holds: Any, sentence: str) -> None:
+    """Refuse a file with a sentence for the reader unless a condition holds."""
+    if not holds:
+        raise PlanError(sentence)
+
+
 def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
     where = f"zone {number} of {file}"
-    if not isinstance(entry, dict):
-        raise PlanError(
-            f"{where} should be a table with a name and a circle or a polygon; as in {_EXAMPLE}"
-        )
-    for key in entry:
-        if key not in _KEYS:
-            near = difflib.get_close_matches(key, _KEYS, 1, cutoff=0.0)[0]
-            raise PlanError(f"{where} has an unknown key '{key}'; the nearest known key is {near}")
-    name = entry.get("name")
-    if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name)):
-        raise PlanError(
-            f"{where} needs a name of letters, digits and _, for columns are named after it, got "
-            f"{name!r}"
-        )
-    where = f"zone '{name}' of {file}"
-    unit = entry.get("unit", "mm")
-    relative = entry.get("relative_to")
-    if unit not in ("mm", "px") or relative not in (None, "centre") or (unit == "px" and relative):
-        raise PlanError(
-            f'{where} should have unit = "mm" or "px", and only with mm optionally relative_to = '
-            '"centre"; correct it'
-        )
-    if ("circle" in entry) == ("polygon" in entry):
-        raise PlanError(f"{where} should have either a circle or a polygon; as in {_EXAMPLE}")
-    if "polygon" in entry:
-        return DrawnZone(
-            name, _pairs(_polygon(where, entry["polygon"])), None, unit, relative, where
-        )
-    circle = entry["circle"]
-    if not isinstance(circle, dict) or set(circle) != {"centre", "radius"}:
-        raise PlanError(
-            f"{where}: a circle is written as {{ centre = [0, 0], radius = 80 }}, got {circle!r}"
-        )
-    if not (_is_number(circle["radius"]) and circle["radius"] > 0):
-        raise PlanError(
-            f"{where}: the radius of a circle is a positive number, got {circle['radius']!r}"
-        )
-    return DrawnZone(
-        name, (_point(where, circle["centre"]),), float(circle["radius"]), unit, relative, where
+    _require(
+        isinstance(entry, dict),
+        f"{where} should be a table with a name and a circle or a polygon; as in {_EXAMPLE}",
     )
+    for key in entry:
+        near = difflib.get_close_matches(key, _KEYS, 1, cutoff=0.0)[0]
+        _require(
+            key in _KEYS, f"{where} has an unknown key '{key}'; the nearest known key is {near}"
+        )
+    name = entry.get("name")
+    _require(
+        isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name),
+        f"{where} needs a name of letters, digits and _, for columns are named after it, got "
+        f"{name!r}",
+    )
+    where = f"zone '{name}' of {file}"
+    unit, relative = entry.get("unit", "mm"), entry.get("relative_to")
+    _require(
+        (unit == "mm" and relative in (None, "centre")) or (unit == "px" and relative is None),
+        f'{where} should have unit = "mm" or "px", and only with mm optionally relative_to = '
+        '"centre"; correct it',
+    )
+    _require(
+        ("circle" in entry) != ("polygon" in entry),
+        f"{where} should have either a circle or a polygon; as in {_EXAMPLE}",
+    )
+    if "polygon" in entry:
+        corners = _pairs(_polygon(where, entry["polygon"]))
+        return DrawnZone(name, corners, None, unit, relative, where)
+    circle = entry["circle"]
+    _require(
+        isinstance(circle, dict) and set(circle) == {"centre", "radius"},
+        f"{where}: a circle is written as {{ centre = [0, 0], radius = 80 }}, got {circle!r}",
+    )
+    radius = circle["radius"]
+    _require(
+        _is_number(radius) and radius > 0,
+        f"{where}: the radius of a circle is a positive number, got {radius!r}",
+    )
+    centre = _point(where, circle["centre"])
+    return DrawnZone(name, (centre,), float(radius), unit, relative, where)
 
 
 def _polygon(where: str, polygon: Any) -> Array:
     """The validated corners (n, 2) of a polygon."""
-    if not isinstance(polygon, list) or len(polygon) < 3:
-        raise PlanError(
-            f"{where}: a polygon is a list of at least three corners [x, y], got {polygon!r}"
-        )
+    _require(
+        isinstance(polygon, list) and len(polygon) >= 3,
+        f"{where}: a polygon is a list of at least three corners [x, y], got {polygon!r}",
+    )
     corners = np.array([_point(where, corner) for corner in polygon])
     ends = np.roll(corners, -1, axis=0)
-    if abs((corners[:, 0] * ends[:, 1] - corners[:, 1] * ends[:, 0]).sum()) < 1e-6:
-        raise PlanError(f"{where}: the corners of the polygon enclose no area; correct them")
+    _require(
+        abs((corners[:, 0] * ends[:, 1] - corners[:, 1] * ends[:, 0]).sum()) >= 1e-6,
+        f"{where}: the corners of the polygon enclose no area; correct them",
+    )
     if (crossing := crossing_sides(corners)) is not None:
         raise PlanError(
             f"{where}: sides {crossing[0] + 1} and {crossing[1] + 1} of the polygon cross; list "
@@ -273,10 +400,10 @@ def _polygon(where: str, polygon: Any) -> Array:
 
 
 def _point(where: str, value: Any) -> tuple[float, float]:
-    if not (
-        isinstance(value, list) and len(value) == 2 and all(_is_number(number) for number in value)
-    ):
-        raise PlanError(f"{where}: a point is a pair of numbers [x, y], got {value!r}")
+    _require(
+        isinstance(value, list) and len(value) == 2 and all(map(_is_number, value)),
+        f"{where}: a point is a pair of numbers [x, y], got {value!r}",
+    )
     return float(value[0]), float(value[1])
 
 

@@ -40,7 +40,7 @@ from liex_lab.recordings.formats.messages.mcap import open_replay
 from liex_lab.recordings.frame import region_mask
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import learn_background, sample_frames
-from liex_lab.scene.still_scene import StillScene, at_every_pixel
+from liex_lab.scene.background_segmenter import BackgroundSubtraction, at_every_pixel
 from liex_lab.sessions.provenance import THUMBNAILS, Provenance, reading_from
 from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import Rows
@@ -75,7 +75,7 @@ _SIDES = (1.0, 1.15, 1.4)  # of windows, in lengths of the animal's box on the f
 N_WINDOWS = len(_SIDES) ** 2 + 1  # at most; the last is the whole image
 
 
-def still_scene(recording: Recording, known: StillScene | None = None) -> Depth:
+def still_scene(recording: Recording, known: BackgroundSubtraction | None = None) -> Depth:
     """The background of the whole image, including pixels outside of any region, from 16 frames.
 
     Args:
@@ -92,7 +92,7 @@ def still_scene(recording: Recording, known: StillScene | None = None) -> Depth:
     return smooth if known is None else _without_animals(smooth, known)
 
 
-def _without_animals(image: Depth, known: StillScene) -> Depth:
+def _without_animals(image: Depth, known: BackgroundSubtraction) -> Depth:
     """Replace what the segmentation would take for the animal by the background.
 
     Objects of more than four times the animal's usual area stay: if only the bare plane is known of

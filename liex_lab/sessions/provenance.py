@@ -33,8 +33,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import Gap
 from liex_lab.runtime.places import storable
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.outline import UNKNOWN, Arena
-from liex_lab.scene.scene import Scene
+from liex_lab.scene.scene import UNKNOWN, Arena, Scene
 from liex_lab.scene.zones import Zone
 
 SCHEMA_VERSION = 8

@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import TypeAdapter
 from pydantic.dataclasses import dataclass
 
-from liex_lab.actions.scores import Agreement, cohens_kappa
+from liex_lab.actions.labels import RaterAgreement, cohens_kappa
 from liex_lab.errors import SessionError, one_line
 from liex_lab.runtime import durable, places
 from liex_lab.sessions.corrections import UNREADABLE
@@ -110,7 +110,7 @@ class Review:
         own = {**self.answers.get(rater, {}), clip: word}
         return replace(self, answers={**self.answers, rater: own})
 
-    def agreements(self) -> list[tuple[str, str, Agreement]]:
+    def agreements(self) -> list[tuple[str, str, RaterAgreement]]:
         """Agreement of every two raters who are done, and of each with the program."""
         program = {k: clip.program for k, clip in enumerate(self.clips)}
         raters = [name for name in self.answers if self.done_by(name)]

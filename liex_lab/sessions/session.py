@@ -25,7 +25,7 @@ from liex_lab.errors import MissingPackageError, SessionError, how_to_install
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime import memory, places, text_files
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions.corrections import (
     Log,

@@ -23,7 +23,7 @@ from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import Gap, frames_apart, rounded_step
 from liex_lab.recordings.timestamps import median_step as recorded_step
 from liex_lab.runtime.memory import blocks
-from liex_lab.scene.outline import UNKNOWN, Arena
+from liex_lab.scene.scene import UNKNOWN, Arena
 from liex_lab.scene.zones import Zone, zone_names
 from liex_lab.tables.schema import (
     BOUTS,

@@ -27,7 +27,7 @@ from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import WORDS
 from liex_lab.errors import SessionError
 from liex_lab.runtime.memory import blocks
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 
 ROWS_PER_GROUP = 100_000  # about 20 MB per block of the widest table

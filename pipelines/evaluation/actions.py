@@ -31,14 +31,13 @@ from sklearn.tree import DecisionTreeClassifier
 
 from liex_lab.actions.channels import channel_names, segments_of
 from liex_lab.actions.ethogram import runs_of
-from liex_lab.actions.labels import LabelledTrack
+from liex_lab.actions.labels import LabelledTrack, confusion, interval95, timeline_scores
 from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
-from liex_lab.actions.scores import confusion, interval95, timeline_scores
 from liex_lab.actions.storage import bundled_action_models, load_action_model
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.actions.vocabulary import printed_meanings
+from liex_lab.behaviour.bouts import measure_bouts, recognise
 from liex_lab.behaviour.kinematics import Joints, kinematics
-from liex_lab.behaviour.measures import measure_bouts, recognise
 from liex_lab.errors import LiexError
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.tables.rows import Rows, bout_rows

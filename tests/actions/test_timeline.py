@@ -19,24 +19,20 @@ from skops import io
 from threadpoolctl import threadpool_limits
 
 from liex_lab.actions import storage
-from liex_lab.actions.labels import LabelledTrack, read_labels, some_rows, words_of
+from liex_lab.actions.labels import LabelledTrack, read_labels, some_rows, timeline_scores, words_of
 from liex_lab.actions.learning import doubtful_segments, learn, leave_one_animal_out
-from liex_lab.actions.scores import timeline_scores
 from liex_lab.actions.storage import load_action_model, save_action_model
-from liex_lab.actions.timeline import TimelineModel
+from liex_lab.actions.timeline import SemiMarkovModel, TimelineModel
 from liex_lab.errors import LiexError, ModelError
 from liex_lab.mlp import Network
 from liex_lab.runtime.memory import on_disk
-from tests.actions.toy import GO, STAY, going_and_staying
+from tests.actions.toy import GO, STAY, going_and_staying, trained
+from tests.oracles.actions import every_path
 
 
 @pytest.fixture(scope="module")
 def model() -> TimelineModel:
-    return learn(
-        [going_and_staying(seed) for seed in range(3)],
-        seed=1,
-        definitions={GO: "goes", STAY: "stays"},
-    )
+    return trained()
 
 
 def scores(model: TimelineModel, one: LabelledTrack) -> dict[str, float]:
@@ -189,7 +185,7 @@ def test_a_file_that_is_no_model_is_one_sentence(content: bytes, tmp_path: Path)
 
 
 def test_each_animal_is_scored_by_a_model_that_has_not_seen_it() -> None:
-    report = leave_one_animal_out([going_and_staying(seed, seconds=25.0) for seed in range(2)])
+    report = leave_one_animal_out([going_and_staying(seed, seconds=10.0) for seed in range(2)])
     assert set(report["macro_f1_by_animal"]) == {"mouse-0", "mouse-1"}
     assert report["macro_f1"] > 0.8
     assert "note" in leave_one_animal_out([going_and_staying(0)])
@@ -235,3 +231,60 @@ def test_a_table_that_holds_no_bouts_is_one_sentence(
     path.write_text(text)
     with pytest.raises(LiexError, match=complaint):
         read_labels(path)
+
+
+# The semi-Markov chain agrees with looking at every path, and keeps to shortest durations.
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_best_path_and_probabilities_agree_with_every_path(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    follow = rng.random((3, 3)) * (1 - np.eye(3))
+    chain = SemiMarkovModel(
+        np.array([1.0, 2.0, 1.0]), np.array([2.5, 3.0, 1.6]), follow / follow.sum(1, keepdims=True)
+    )
+    scores = rng.normal(0.0, 1.0, (6, 3))
+    paths = list(every_path(scores, *chain._terms(1.0)))
+    best = max(paths, key=lambda path: path[0])
+    assert list(chain.decode(scores, 1.0)) == best[1]
+    weights = np.exp(np.array([weight for weight, _ in paths]) - best[0])
+    words = np.array([path for _, path in paths])
+    expected = (
+        np.stack([(weights[:, None] * (words == k)).sum(axis=0) for k in range(3)], axis=1)
+        / weights.sum()
+    )
+    np.testing.assert_allclose(chain.probabilities(scores, 1.0), expected, atol=1e-5)
+
+
+def test_no_action_is_shorter_than_its_shortest_but_at_the_ends() -> None:
+    rng = np.random.default_rng(1)
+    chain = SemiMarkovModel(
+        np.array([0.1, 0.5]), np.array([0.6, 0.9]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    )
+    label = chain.decode(rng.normal(0.0, 2.0, (2000, 2)), 0.05)
+    edges = np.flatnonzero(np.diff(label)) + 1
+    lengths = np.diff(edges)
+    kinds = label[edges[:-1]]
+    assert lengths[kinds == 1].min() >= 10
+    assert lengths[kinds == 0].min() >= 2
+
+
+def test_durations_and_successions_are_learned_from_bouts() -> None:
+    chain = SemiMarkovModel.learn([[(0, 1.0), (1, 2.0), (0, 1.2), (1, 2.2)]], 3)
+    assert chain.mean_s[:2] == pytest.approx([1.1, 2.1])
+    assert chain.follow[0, 1] > chain.follow[0, 2]
+    np.testing.assert_allclose(chain.follow.sum(axis=1), 1.0)
+
+
+def test_pieces_of_a_long_recording_have_the_probabilities_of_the_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(2)
+    chain = SemiMarkovModel(
+        np.array([0.1, 0.3]), np.array([0.6, 0.9]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    )
+    scores = rng.normal(0.0, 1.0, (900, 2))
+    whole = chain.probabilities(scores, 0.05)
+    monkeypatch.setattr("liex_lab.actions.timeline._DECODED_PIECE", 100)
+    monkeypatch.setattr("liex_lab.actions.timeline._MARGIN", 80)
+    np.testing.assert_allclose(chain.probabilities(scores, 0.05), whole, atol=1e-4)

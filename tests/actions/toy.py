@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 
+from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.learning import learn
 from liex_lab.actions.timeline import TimelineModel
@@ -58,11 +62,15 @@ def going_and_staying(
     return LabelledTrack(track, np.where(going, GO, STAY), f"{animal}-{seed}")
 
 
+@cache
+def trained() -> TimelineModel:
+    """A recogniser that names going and staying, trained once per run."""
+    tracks = [going_and_staying(seed, seconds=16.0) for seed in range(3)]
+    return learn(tracks, seed=1, definitions={GO: "goes", STAY: "stays"})
+
+
 def taught_to_lie() -> TimelineModel:
-    """A recogniser that was taught to call going a pause, and staying a freeze."""
-    taught = []
-    for seed in range(3):
-        one = going_and_staying(seed)
-        words = np.where(one.words == GO, "pause", "freeze")
-        taught.append(LabelledTrack(one.track, words, one.animal))
-    return learn(taught, seed=1, definitions=DEFINITIONS["mouse"])
+    """The same, but it calls going a pause, and staying a freeze."""
+    assert trained().words == (UNLABELLED, GO, STAY)
+    words = (UNLABELLED, "pause", "freeze")
+    return replace(trained(), words=words, definitions=DEFINITIONS["mouse"])

@@ -12,7 +12,7 @@ from liex_lab.behaviour.body import (
     BRANCHES,
     KINDS,
     BodyAxis,
-    curves_of,
+    drawn_measures,
     kind_of,
     logged_of,
     parents_of,
@@ -34,8 +34,8 @@ def words(name: str) -> str:
     return " ".join(f"{one.title} {one.what}" for one in logged_of(animal(name)))
 
 
-def test_each_animal_has_the_curves_of_what_it_has():
-    assert [one.title for one in curves_of(animal("mouse"))] == ["Speed", "Nose height"]
+def test_each_animal_has_the_drawn_measures_what_it_has():
+    assert [one.title for one in drawn_measures(animal("mouse"))] == ["Speed", "Nose height"]
     assert "Tail beat" in words("fish")
     assert "nose" not in words("fish").lower()
     hand = words("hand")
@@ -46,7 +46,7 @@ def test_each_animal_has_the_curves_of_what_it_has():
 
 def test_a_chain_without_a_nose_is_named_by_its_own_joint():
     snake = {"joints": ["tail_end", "belly", "snout"], "bones": [[0, 1], [1, 2]]}
-    assert [one.title for one in curves_of(snake)] == ["Speed", "Snout height"]
+    assert [one.title for one in drawn_measures(snake)] == ["Speed", "Snout height"]
 
 
 def test_the_parts_of_a_hand_are_its_palm_and_fingers():

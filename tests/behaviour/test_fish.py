@@ -7,8 +7,7 @@ import pandas as pd
 import pytest
 
 from liex_lab.behaviour import Surroundings, measure, measure_bouts
-from liex_lab.behaviour.kinematics import ERROR_LASTS_S, kinematics
-from liex_lab.behaviour.posture import turning_points
+from liex_lab.behaviour.kinematics import ERROR_LASTS_S, kinematics, turning_points
 from liex_lab.tables.schema import BOUTS, to_pandas
 from tests.behaviour.swimming_fish import LENGTH_MM, SwimmingFish, uneven
 
@@ -199,13 +198,6 @@ def test_depth_preference_is_of_the_water_s_thirds():
     blind = measure(frames, poses)
     assert np.isnan(blind.summary["top_third_share"].iloc[0])
     assert blind.kinematics["below_surface_mm"].isna().all()
-
-
-def test_a_lost_fish_has_no_numbers_and_its_neighbours_have_theirs():
-    moved = kinematics(*SwimmingFish(np.arange(100) / 50.0, beat_hz=4.0, lost=(30, 31)).tables())
-    for name in ("speed_mm_s", "bend_rad", "tail_mm", "tail_beat_hz", "length_mm"):
-        assert moved[name].iloc[[30, 31]].isna().all(), name
-    assert moved["speed_mm_s"].drop([30, 31]).notna().all()
 
 
 def test_turning_points_are_those_a_reader_would_mark():

@@ -59,6 +59,9 @@ def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, mo
     on_the_disk = kinematics(*told, surface_z_mm=90.0, allocate=on_disk(tmp_path))
     rest()
     pd.testing.assert_frame_equal(on_the_disk, in_memory, check_exact=True)
+    if not swims:
+        of_track = kinematics(told[0], Joints.of_track(mouse.track()))
+        pd.testing.assert_frame_equal(of_track, in_memory, check_exact=True)
 
 
 def test_a_dropped_frame_and_an_uneven_clock_leave_the_speed_as_it_is():
@@ -158,28 +161,8 @@ def test_body_points_are_found_by_name_or_along_the_chain():
     assert (alone.front, alone.rear, alone.back) == (0, 0, (0,))
 
 
-def test_the_table_has_the_listed_columns_and_one_row_per_frame():
-    moved = kinematics(*tables_of(WalkingMouse(steady(1.0))))
-    assert list(moved.columns) == [
-        column.name for column in schema.table_columns("kinematics", STANDS)
-    ]
-    assert len(moved) == 30
-
-
 def test_a_single_frame_has_a_row_and_no_speed():
     moved = kinematics(*tables_of(WalkingMouse(steady(1 / 30))))
     assert len(moved) == 1
     assert moved["speed_mm_s"].isna().all()
     assert moved["nose_height_mm"].iloc[0] == pytest.approx(18.0)
-
-
-def test_measures_made_in_blocks_from_the_track_are_those_of_the_whole_table(monkeypatch):
-    mouse = WalkingMouse(steady(2.0), lost=(10, 11, 25))
-    frames, poses = tables_of(mouse)
-    whole = kinematics(frames, poses)
-    monkeypatch.setitem(
-        kinematics.__globals__, "_BLOCK", 7
-    )  # the package names the function like its module
-    pd.testing.assert_frame_equal(
-        kinematics(frames, Joints.of_track(mouse.track())), whole, check_exact=True
-    )

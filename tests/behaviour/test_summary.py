@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from liex_lab.behaviour import ACTIONS, measure
-from liex_lab.tables.schema import Vocabulary
 from tests.behaviour.test_kinematics import tables_of
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, steady
 
@@ -40,16 +39,15 @@ def test_the_time_budget_is_of_the_observed_time_and_adds_up():
     assert sum(row[f"{word}_share"] for word in words) == pytest.approx(1.0)
 
 
-def test_an_animal_never_seen_has_a_row_that_says_so():
-    row = summary_of(WalkingMouse(steady(1.0), lost=tuple(range(30))))
+def test_an_animal_never_observed_has_its_tables_without_numbers():
+    found = measure(*tables_of(WalkingMouse(steady(1.0), lost=tuple(range(30)))))
+    row = found.summary.iloc[0]
     assert (row["n_lost"], row["observed_s"], row["rear_count"]) == (30, 0.0, 0)
     assert np.isnan(row["mean_speed_mm_s"])
-
-
-def test_the_row_has_the_listed_columns():
-    summary = measure(*tables_of(WalkingMouse(steady(1.0)))).summary
-    assert list(summary.columns) == [column.name for column in Vocabulary(ACTIONS).table("summary")]
-    assert len(summary) == 1
+    assert len(found.bouts) == 0
+    assert "peak_speed_mm_s" in found.bouts
+    assert (found.activity["observed_s"] == 0).all()
+    assert found.activity["mean_speed_mm_s"].isna().all()
 
 
 def named(mouse: WalkingMouse, *spans: tuple[str, float, float]) -> pd.DataFrame:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -10,20 +12,25 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import binomtest
 
 from liex_lab.behaviour import ACTIONS, Surroundings, measure, measure_session
 from liex_lab.behaviour.activity import (
+    _binomial,
     activity,
     by_chance,
     count_transitions,
+    hold_times,
     intervals,
+    occupancy,
+    outer_margin_mm,
     transitions,
+    visits,
 )
-from liex_lab.behaviour.measures import measure_bouts
-from liex_lab.behaviour.places import outer_margin_mm, visits
+from liex_lab.behaviour.bouts import measure_bouts
 from liex_lab.behaviour.statistics import false_discovery
 from liex_lab.behaviour.summary import summarise
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone, zone_names
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import BOUTS, GAPS, Vocabulary, empty_table, to_pandas
@@ -315,14 +322,7 @@ def test_named_and_unlabelled_time_is_the_observed_time_whatever_was_lost(case):
         assert sum(row[f"{word}_share"] for word in slow) == pytest.approx(1.0)
 
 
-def test_activity_has_a_row_for_every_interval_of_an_animal_never_seen():
-    frames, poses = tables_of(WalkingMouse(steady(2.0), lost=tuple(range(60))))
-    table = activity(measure(frames, poses).kinematics, empty_table(BOUTS), ("walk",))
-    assert (table["observed_s"] == 0).all()
-    assert table["mean_speed_mm_s"].isna().all()
-
-
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_hour_is_measured_in_a_few_seconds():
     frames, poses = tables_of(
         WalkingMouse(steady(3600.0), rear_s=(1000.0, 1500.0), speed_mm_s=90.0)
@@ -352,3 +352,80 @@ def test_the_tables_can_be_made_again_from_the_session_s_folder_alone(tmp_path):
         "activity",
         "zones",
     }
+
+
+# Transitions between actions: their test of chance is SciPy's exact binomial test.
+
+
+@pytest.mark.parametrize("total", [1, 2, 7, 60, 3000])
+def test_the_exact_binomial_test_is_that_of_scipy(total: int) -> None:
+    rng = np.random.default_rng(total)
+    for chance in (0.5, 0.02, 1.0 / 3.0, 0.97):
+        for n in {0, total, *rng.integers(0, total + 1, 8).tolist()}:
+            expected = binomtest(n, total, chance).pvalue
+            assert _binomial(n, total, chance) == pytest.approx(expected, rel=1e-9, abs=1e-300)
+
+
+def test_where_chance_leaves_no_choice_there_is_no_p() -> None:
+    assert np.isnan(_binomial(0, 0, 0.5))
+    assert np.isnan(_binomial(3, 5, 1.0))
+
+
+RUN = (
+    "from liex_lab.api import run_session; from liex_lab.plan import Plan;"
+    "run_session('synthetic:walk?seed=3&frames=40&sensor=primesense-qvga&spine_mm=70',"
+    " Plan.load('mouse'), tempfile.mkdtemp())"
+)
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        "import liex_lab.api, liex_lab.pipelines.session, liex_lab.behaviour.summary",
+        pytest.param(RUN, marks=pytest.mark.nightly),
+    ],
+)
+def test_a_run_does_without_the_statistics_of_scipy(work: str) -> None:
+    """They take longer to import than all poses of a second take to measure."""
+    code = f"import sys, tempfile; {work}; assert 'scipy.stats' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+
+
+# Time on the floor is neither lost nor made.
+
+
+@pytest.mark.parametrize("sd_mm", [0.0, 5.0, 40.0])
+def test_the_cells_add_up_to_the_observed_time(sd_mm):
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-120.0, 120.0, (500, 2))
+    xy[100:150] = np.nan
+    hold = rng.uniform(0.01, 0.1, 500)
+    found = occupancy(xy, hold, [-120.0, -120.0], [120.0, 120.0], sd_mm)
+    seen = np.isfinite(xy).all(axis=1)
+    assert found.n == 450
+    assert found.observed_s == pytest.approx(hold[seen].sum())
+    area = np.outer(np.diff(found.y_mm), np.diff(found.x_mm)) / 100.0
+    assert (found.per_cm2 * area).sum() == pytest.approx(found.observed_s)
+
+
+def test_a_place_outside_of_the_rectangle_widens_it():
+    found = occupancy([[500.0, 0.0]], [2.0], [-100.0, -100.0], [100.0, 100.0])
+    assert found.observed_s == pytest.approx(2.0)
+    assert found.x_mm[-1] >= 500.0
+
+
+def test_where_it_sat_is_the_fullest_cell():
+    xy = np.array([[10.0, -40.0]] * 50 + [[-60.0, 60.0]] * 5)
+    found = occupancy(xy, np.full(55, 0.1), [-100.0, -100.0], [100.0, 100.0])
+    row, column = np.unravel_index(found.time_s.argmax(), found.time_s.shape)
+    assert found.x_mm[column] <= 10.0 + 5.0 <= found.x_mm[column + 1] + 5.0
+    assert found.y_mm[row] - 5.0 <= -40.0 <= found.y_mm[row + 1] + 5.0
+
+
+def test_nobody_seen_is_no_time_and_no_error():
+    found = occupancy(np.full((3, 2), np.nan), np.ones(3), [0.0, 0.0], [10.0, 10.0])
+    assert (found.n, found.observed_s) == (0, 0.0)
+
+
+def test_the_last_frame_and_one_before_a_gap_count_as_long_as_usual():
+    np.testing.assert_allclose(hold_times([0.0, 0.1, 0.2, 5.0, 5.1]), [0.1, 0.1, 0.1, 0.1, 0.1])

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from liex_lab.dashboards.report.report import write_report
 
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.sessions import Session
 from liex_lab.sessions.folder import write_failure
 from tests.sessions.walking_mouse import WalkingMouse, steady, write

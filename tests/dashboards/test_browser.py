@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.report.report import render
 
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from tests.dashboards.conftest import Watched
 from tests.sessions.walking_mouse import WalkingMouse, steady, write

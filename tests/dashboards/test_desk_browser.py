@@ -15,7 +15,7 @@ from playwright.sync_api import Locator, Page, Route, expect
 
 from liex_lab.api import run_session
 from liex_lab.plan import Plan
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
 from tests.dashboards.conftest import Watched, until

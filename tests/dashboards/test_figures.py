@@ -23,7 +23,7 @@ from liex_lab.api import compare_groups, draw_figures
 from liex_lab.behaviour.cohort import compare
 from liex_lab.errors import PlaceError, SessionError
 from liex_lab.plan import Plan
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write

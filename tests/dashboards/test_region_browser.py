@@ -12,8 +12,7 @@ from playwright.sync_api import Page, expect
 
 from liex_lab.plan import Plan
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.outline import Arena
-from liex_lab.scene.scene import Fixture, Scene
+from liex_lab.scene.scene import Arena, Fixture, Scene
 from tests.conftest import REPOSITORY
 from tests.dashboards.conftest import Watched
 from tests.dashboards.served import Served

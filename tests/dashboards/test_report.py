@@ -22,7 +22,7 @@ from liex_lab.body import Skeleton
 from liex_lab.exchange import export
 from liex_lab.optics.refraction import Water
 from liex_lab.recordings.timestamps import find_gaps, median_step
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions.rrd import PALETTE

@@ -11,8 +11,7 @@ from liex_lab.dashboards.report.charts import pictures
 from liex_lab.dashboards.report.contact_sheet import Mark, picture, scene_marks
 
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.outline import Arena
-from liex_lab.scene.scene import Fixture, Scene
+from liex_lab.scene.scene import Arena, Fixture, Scene
 from liex_lab.sessions import Session
 from tests.sessions import walking_mouse
 from tests.sessions.walking_mouse import FLOOR_MM, SMALL, WalkingMouse, steady, write

@@ -12,7 +12,7 @@ from liex_lab.dashboards.report.report import render
 
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.scene.outline import UNKNOWN
+from liex_lab.scene.scene import UNKNOWN
 from liex_lab.sessions import Session
 from liex_lab.sessions.provenance import SCHEMA_VERSION
 from tests.golden.write import ARENA, CAMERA, HERE, TABLES, ZONES, contents

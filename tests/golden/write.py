@@ -18,7 +18,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
 from liex_lab.recordings.timestamps import find_gaps, median_step
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import WalkingMouse, write

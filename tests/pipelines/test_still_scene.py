@@ -11,7 +11,6 @@ from liex_lab.pipelines.origin import build_background
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from liex_lab.scene.still_scene import StillScene
 from liex_lab.sessions.cutouts import still_scene
 from tests.scene.test_background_segmenter import (
     CAMERA,
@@ -40,7 +39,7 @@ def off(picture: np.ndarray) -> np.ndarray:
     return BARE - picture.astype(np.float64)
 
 
-def coarser(scene: StillScene, stride: int) -> StillScene:
+def coarser(scene: BackgroundSubtraction, stride: int) -> BackgroundSubtraction:
     """The scene as it is learned where only every so many-th pixel is looked at."""
     every = scene.every(stride)
     return replace(every, camera=scene.camera, floor=scene.floor, stride=stride)

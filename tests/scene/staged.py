@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from unittest.mock import patch
 
 import numpy as np
@@ -63,17 +64,31 @@ def walk(scene: SimulatedScene, n_frames: int = 96, seed: int = 5, **more) -> Sy
         return walking_session(seed, n_frames, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=65.0, **more)
 
 
-def changed(
-    recording: Recording, change: Callable[[int, np.ndarray], np.ndarray], n_frames: int = 0
-) -> Recording:
-    """A recording with every picture changed."""
-    n = n_frames or len(recording)
+@cache
+def walked(n_frames: int = 64) -> tuple[SyntheticSession, np.ndarray]:
+    """A mouse that walks in a plain arena, and its depth images, rendered once."""
+    mouse = walk(stage((170.0, 150.0), height_mm=700.0, room=False), n_frames)
+    return mouse, mouse.depths(0, n_frames)
+
+
+@cache
+def on_a_table(n_frames: int = 24) -> tuple[SyntheticSession, np.ndarray]:
+    """The same in an arena on a table, with the floor of the room in view."""
+    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), n_frames)
+    return mouse, mouse.depths(0, n_frames)
+
+
+def shown(depths: np.ndarray) -> Recording:
+    """A recording of these images."""
     return Recording(
-        name=recording.name,
+        name="shown",
         format="synthetic",
-        camera=recording.camera,
-        times_ns=np.arange(n) * 33_333_333,
-        read=lambda k: change(k, recording.frame(min(k, len(recording) - 1)).depth).astype(
-            np.float32
-        ),
+        camera=CAMERA,
+        times_ns=np.arange(len(depths)) * 33_333_333,
+        read=lambda k: depths[k],
     )
+
+
+def altered(depths: np.ndarray, change: Callable[[int, np.ndarray], np.ndarray]) -> Recording:
+    """A recording of these images, each changed by `change(number, image)`."""
+    return shown(np.stack([change(k, one).astype(np.float32) for k, one in enumerate(depths)]))

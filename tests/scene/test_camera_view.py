@@ -71,65 +71,57 @@ def test_what_hangs_together_with_the_animal_but_lies_far_behind_it_is_left_out(
     assert crops.distance[0] == pytest.approx(FLOOR.distance_mm - HIGH + BEHIND, abs=0.2)
 
 
-def under_a_beam(thing: float, columns: slice) -> tuple[np.ndarray, np.ndarray]:
-    """The bar with a beam of depth `thing` mm over some columns, and the same with the beam's
-    readings missing.
-    """
-    frame, unread = bar(), bar()
-    frame[:, columns], unread[:, columns] = thing, 0.0
-    return frame, unread
-
-
-@pytest.mark.parametrize("columns", [slice(40, 70), slice(150, 230)])
-def test_a_thing_far_before_the_animal_is_taken_for_unread_though_they_touch_in_the_picture(
-    columns,
-):
-    known = replace(scene("camera"), area_mm2=480.0)
-    frame, unread = under_a_beam(150.0, columns)
-    crops, alone = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, unread))
-    assert crops.n_px[0] > 0.5 * known.extract(bar()[None], 1.0, camera_view=True).n_px[0]
-    np.testing.assert_array_equal(crops.n_px, alone.n_px)
-    np.testing.assert_array_equal(crops.heights, alone.heights)
-    np.testing.assert_array_equal(crops.moments, alone.moments)
-    whole = known.extract(np.rint(frame[None]).astype(np.uint16), 1.0, camera_view=True)
-    np.testing.assert_array_equal(whole.n_px, alone.n_px)
-
-
-def test_a_larger_thing_far_behind_the_animal_is_background_though_they_touch_in_the_picture():
-    known = replace(scene("camera"), area_mm2=480.0)
-    alone = bar()
-    alone[alone < FLOOR.distance_mm - 20.0] -= 20.0
+def beside(alone: np.ndarray, *things: tuple[slice, slice, float]) -> np.ndarray:
+    """An image with things in some rows and columns, at a depth, mm."""
     frame = alone.copy()
-    beside = (slice(60, 130), slice(170, 230))
-    frame[beside] = np.minimum(alone[beside], FLOOR.distance_mm - 4.0)  # low on the floor
+    for rows, columns, depth in things:
+        frame[rows, columns] = depth
+    return frame
+
+
+ALL, LOW = slice(None), FLOOR.distance_mm - 4.0
+RAISED = np.where(bar() < FLOOR.distance_mm - 20.0, bar() - 20.0, bar())
+UPRIGHT = bar(turned=0.0)
+UPRIGHT[FLOOR.distance_mm - 20.0 > UPRIGHT] -= 60.0
+SPECKS = slice(60, 72), FLOOR.distance_mm - 10.0
+TOUCHING: dict[str, tuple[float, np.ndarray, np.ndarray]] = {
+    "a beam in front of one end is taken for unread": (
+        480.0,
+        beside(bar(), (ALL, slice(40, 70), 150.0)),
+        beside(bar(), (ALL, slice(40, 70), 0.0)),
+    ),
+    "a beam in front of the other end, too": (
+        480.0,
+        beside(bar(), (ALL, slice(150, 230), 150.0)),
+        beside(bar(), (ALL, slice(150, 230), 0.0)),
+    ),
+    "a larger thing far behind is background": (
+        480.0,
+        np.minimum(RAISED, beside(RAISED, (slice(60, 130), slice(170, 230), LOW))),
+        RAISED,
+    ),
+    "an animal between a beam and specks far behind it": (
+        280.0,
+        beside(UPRIGHT, (ALL, slice(150, 230), 150.0), (SPECKS[0], slice(146, 150), SPECKS[1])),
+        beside(UPRIGHT, (ALL, slice(150, 230), 0.0)),
+    ),
+    "a thing elsewhere, larger than the animal and likest to it": (
+        480.0,
+        beside(bar(), (ALL, slice(0, 40), 200.0), (SPECKS[0], slice(40, 44), SPECKS[1])),
+        bar(),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TOUCHING)
+def test_things_that_touch_the_animal_in_the_image_do_not_change_it(name: str) -> None:
+    area_mm2, frame, alone = TOUCHING[name]
+    known = replace(scene("camera"), area_mm2=area_mm2)
     crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, alone))
-    np.testing.assert_array_equal(crops.n_px, same.n_px)
-    np.testing.assert_array_equal(crops.heights, same.heights)
-
-
-def test_an_animal_between_a_thing_before_it_and_specks_far_behind_it_is_told_apart_from_both():
-    alone = bar(turned=0.0)
-    alone[alone < FLOOR.distance_mm - 20.0] -= 60.0
-    known = replace(scene("camera"), area_mm2=280.0)
-    frame, unread = alone.copy(), alone.copy()
-    frame[:, 150:230], unread[:, 150:230] = 150.0, 0.0
-    frame[60:72, 146:150] = FLOOR.distance_mm - 10.0
-    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, unread))
     assert crops.n_px[0] > 0
     np.testing.assert_array_equal(crops.n_px, same.n_px)
-    np.testing.assert_array_equal(crops.moments, same.moments)
-
-
-def test_a_thing_elsewhere_that_hangs_with_specks_behind_it_does_not_take_the_animal_away():
-    known = replace(scene("camera"), area_mm2=480.0)
-    alone = bar()
-    frame = alone.copy()
-    frame[:, :40] = 200.0  # larger than the animal, and likest to it of what hangs together there
-    frame[60:72, 40:44] = FLOOR.distance_mm - 10.0
-    crops, same = (known.extract(each[None], 1.0, camera_view=True) for each in (frame, alone))
-    assert crops.n_blobs[0] == 2
-    np.testing.assert_array_equal(crops.n_px, same.n_px)
     np.testing.assert_array_equal(crops.heights, same.heights)
+    np.testing.assert_array_equal(crops.moments, same.moments)
 
 
 def test_readings_missing_across_the_body_do_not_part_it():

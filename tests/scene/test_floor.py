@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
 from liex_lab.optics.camera import Camera
-from liex_lab.scene.floor import Floor
+from liex_lab.scene.background import unread_floor
+from liex_lab.scene.floor import Floor, components
 
 CAMERA = Camera(365.0, 365.0, 255.5, 211.5, 512, 424)
 
@@ -20,24 +22,96 @@ def floor_below(distance_mm: float, tilt_deg: float) -> Floor:
     return Floor.from_plane(normal, distance_mm, CAMERA)
 
 
-@pytest.mark.parametrize("distance_mm", [200.0, 700.0, 2900.0])
-@pytest.mark.parametrize("tilt_deg", [0.0, 9.0])
-def test_nothing_is_said_of_a_camera_as_labs_hang_it(distance_mm: float, tilt_deg: float) -> None:
-    assert floor_below(distance_mm, tilt_deg).unusual() == []
-
-
-def test_a_camera_that_looks_aslant_is_told_by_how_much() -> None:
-    (said,) = floor_below(700.0, 35.0).unusual()
-    assert "looks down at 35 degrees" in said
-
-
-@pytest.mark.parametrize("distance_mm", [70.0, 7000.0])
-def test_a_floor_that_is_unlikely_far_away_is_told(distance_mm: float) -> None:
-    (said,) = floor_below(distance_mm, 0.0).unusual()
-    assert f"{distance_mm:.0f} mm from the camera" in said
+@pytest.mark.parametrize(
+    ("distance_mm", "tilt_deg", "problem"),
+    [
+        (200.0, 0.0, ""),
+        (2900.0, 9.0, ""),
+        (700.0, 35.0, "looks down at 35 degrees"),
+        (70.0, 0.0, "70 mm from the camera"),
+        (7000.0, 0.0, "7000 mm from the camera"),
+    ],
+)
+def test_an_unusual_camera_position_is_reported(
+    distance_mm: float, tilt_deg: float, problem: str
+) -> None:
+    found = floor_below(distance_mm, tilt_deg).unusual()
+    assert len(found) == bool(problem)
+    assert problem in "".join(found)
 
 
 def test_the_distance_from_a_lens_above_water_is_that_of_the_lens() -> None:
     lift = np.array([0.0, 0.0, 60.0])  # the ideal camera is 60 mm nearer to the floor
     assert floor_below(400.0, 0.0).lens_distance_mm(-lift) == pytest.approx(460.0)
     assert floor_below(140.0, 0.0).unusual(-lift) == []
+
+
+# Components in a box are those of the whole picture, in the same order.
+
+
+@pytest.mark.parametrize("density", [0.01, 0.2, 0.45, 0.7])
+@pytest.mark.parametrize("box", [(0, 60, 0, 80), (7, 52, 13, 71), (8, 9, 3, 80), (59, 60, 79, 80)])
+def test_components_are_those_of_the_whole_picture(
+    density: float, box: tuple[int, int, int, int]
+) -> None:
+    rng = np.random.default_rng(int(100 * density) + sum(box))
+    mask = np.zeros((60, 80), np.uint8)
+    inside = (slice(*box[:2]), slice(*box[2:]))
+    mask[inside] = rng.random(mask[inside].shape) < density
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask)
+    found, sizes = components(mask)
+    np.testing.assert_array_equal(found, labels)
+    np.testing.assert_array_equal(sizes[1:], stats[1:])
+
+
+def test_an_empty_mask_has_no_component() -> None:
+    labels, stats = components(np.zeros((5, 7), np.uint8))
+    assert not labels.any()
+    assert len(stats) == 1
+
+
+# Where a glossy floor is unread, what stood there is no background.
+
+
+FLOOR_MM = 700.0
+
+
+def taken(sample: np.ndarray) -> np.ndarray:
+    """Where something was taken for the floor, in a sample whose farthest readings are known."""
+    bare = np.full(sample.shape[1:], FLOOR_MM, np.float32)
+    background = sample.max(axis=0)
+    return unread_floor(sample, background, bare, np.ones(bare.shape, np.bool_), 7.0, 30.0)
+
+
+def frames() -> np.ndarray:
+    return np.full((40, 60, 80), FLOOR_MM, np.float32)
+
+
+def test_an_animal_that_stood_on_an_unread_patch_is_no_background() -> None:
+    sample = frames()
+    sample[:, 20:40, 30:50] = 0.0
+    sample[:12, 25:35, 35:45] = FLOOR_MM - 25.0
+    found = taken(sample)
+    assert found[25:35, 35:45].all()
+    assert found.sum() == 100
+
+
+def test_a_thing_that_stays_and_is_read_is_background() -> None:
+    sample = frames()
+    sample[:, 20:40, 30:50] = FLOOR_MM - 40.0
+    assert not taken(sample).any()
+
+
+def test_a_dark_thing_on_a_wall_is_none_of_the_floor() -> None:
+    sample = frames()
+    sample[:, 10:50, 20:60] = FLOOR_MM - 80.0
+    sample[:, 20:40, 30:50] = 0.0
+    sample[:12, 20:40, 30:50] = FLOOR_MM - 100.0
+    assert not taken(sample).any()
+
+
+def test_specks_hide_no_animal() -> None:
+    sample = frames()
+    sample[:, 20:24, 30:34] = 0.0
+    sample[:12, 20:24, 30:34] = FLOOR_MM - 25.0
+    assert not taken(sample).any()

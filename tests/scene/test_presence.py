@@ -8,20 +8,18 @@ import numpy as np
 import pytest
 
 from liex_lab.errors import EstimationError
-from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import learn_background
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from tests.scene.staged import changed, stage, walk
+from tests.scene.staged import shown, walked
 
 SPINES = (40.0, 115.0)
 N_FRAMES = 48
 
 
 @cache
-def filmed() -> tuple[Recording, np.ndarray, np.ndarray]:
-    """A mouse that walks, its pictures, and pictures of the same arena without it."""
-    mouse = walk(stage((170.0, 150.0), height_mm=700.0, room=False), N_FRAMES)
-    busy = mouse.depths(0, N_FRAMES)
+def filmed() -> tuple[np.ndarray, np.ndarray]:
+    """Images of a mouse that walks, and of the same arena without it."""
+    busy = walked()[1][:N_FRAMES]
     background = learn_background(busy)[0]
     noise = np.random.default_rng(0).normal(0.0, 1.2, busy.shape)
     there = (background - busy > 4.0) | ((busy == 0) & (background > 0))
@@ -29,23 +27,22 @@ def filmed() -> tuple[Recording, np.ndarray, np.ndarray]:
     for v in range(-3, 4):
         for u in range(-3, 4):
             near |= np.roll(there, (v, u), (1, 2))
-    return mouse, busy, np.where(near, background + noise * (background > 0), busy)
+    return busy, np.where(near, background + noise * (background > 0), busy)
 
 
 def found(pictures: np.ndarray) -> tuple[BackgroundSubtraction, np.ndarray]:
-    shown = changed(filmed()[0], lambda k, _: pictures[k])
-    scene, sample = BackgroundSubtraction.learn(shown, SPINES, N_FRAMES)
+    scene, sample = BackgroundSubtraction.learn(shown(pictures), SPINES, N_FRAMES)
     return scene, scene.extract(sample, 1.0).found
 
 
 def test_an_empty_arena_holds_no_animal():
-    _, _, empty = filmed()
+    _, empty = filmed()
     with pytest.raises(EstimationError, match="no animal was found"):
         found(empty)
 
 
 def test_an_animal_that_comes_after_two_thirds_is_found_when_it_comes():
-    _, busy, empty = filmed()
+    busy, empty = filmed()
     scene, there = found(np.concatenate([empty[:32], busy[32:]]))
     assert there[32:].all()
     assert not there[:32].any()
@@ -53,16 +50,15 @@ def test_an_animal_that_comes_after_two_thirds_is_found_when_it_comes():
 
 
 def test_an_animal_that_leaves_is_found_until_it_leaves():
-    _, busy, empty = filmed()
+    busy, empty = filmed()
     _, there = found(np.concatenate([busy[:14], empty[14:]]))
     assert there[:14].all()
     assert not there[14:].any()
 
 
 def test_specks_of_an_edge_that_flickers_are_no_animal_beside_one_that_sleeps():
-    _, busy, empty = filmed()
-    there = busy[5:6] > 0
-    asleep = np.where(there, busy[5:6] + empty - empty.mean(axis=0), 0.0)
+    busy, empty = filmed()
+    asleep = np.where(busy[5:6] > 0, busy[5:6] + empty - empty.mean(axis=0), 0.0)
     specks = asleep.copy()
     specks[::2, 20:26, 40:70] -= 70.0 * (specks[::2, 20:26, 40:70] > 0)
     scene, seen = found(specks)
@@ -72,16 +68,15 @@ def test_specks_of_an_edge_that_flickers_are_no_animal_beside_one_that_sleeps():
 
 @pytest.mark.parametrize("n_asleep", [41, 48])
 def test_an_animal_that_sleeps_for_most_or_all_of_the_time_is_found_whole(n_asleep):
-    _, busy, empty = filmed()
-    there = busy[5:6] > 0
-    asleep = np.where(there, busy[5:6] + empty - empty.mean(axis=0), 0.0)
+    busy, empty = filmed()
+    asleep = np.where(busy[5:6] > 0, busy[5:6] + empty - empty.mean(axis=0), 0.0)
     scene, seen = found(np.concatenate([asleep[:n_asleep], busy[n_asleep:]]))
     assert seen.all()
     assert 900.0 < scene.area_mm2 < 2000.0
 
 
 def test_a_resting_thing_larger_than_any_such_animal_is_none():
-    _, _, empty = filmed()
+    _, empty = filmed()
     box = empty.copy()
     box[:, 60:150, 130:220] -= np.where(box[:, 60:150, 130:220] > 0, 60.0, 0.0)
     with pytest.raises(EstimationError, match="no animal was found"):
@@ -89,7 +84,7 @@ def test_a_resting_thing_larger_than_any_such_animal_is_none():
 
 
 def test_a_house_is_not_taken_for_the_animal_that_comes_late():
-    _, busy, empty = filmed()
+    busy, empty = filmed()
     pictures = np.concatenate([empty[:32], busy[32:]])
     house = np.zeros(pictures.shape[1:], bool)
     house[75:90, 200:225] = True
@@ -100,9 +95,8 @@ def test_a_house_is_not_taken_for_the_animal_that_comes_late():
 
 
 def test_the_foot_of_a_wall_is_not_the_animal_that_sleeps_all_the_time():
-    _, busy, empty = filmed()
-    there = busy[5:6] > 0
-    asleep = np.where(there, busy[5:6] + empty - empty.mean(axis=0), 0.0)
+    busy, empty = filmed()
+    asleep = np.where(busy[5:6] > 0, busy[5:6] + empty - empty.mean(axis=0), 0.0)
     asleep[:, 165:170, 95:225] -= np.where(asleep[:, 165:170, 95:225] > 0, 14.0, 0.0)
     scene, seen = found(asleep)
     assert seen.all()

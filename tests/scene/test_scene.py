@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,25 +13,16 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
 from liex_lab.recordings.frame import region_mask
-from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.scene import find_fixtures, plane_of
-from tests.scene.staged import CAMERA, changed, stage, walk
+from tests.scene.staged import CAMERA, on_a_table, shown
 
 N_FRAMES = 24
 
 
-@cache
-def on_a_table() -> Recording:
-    """A mouse in an arena on a table, the floor of the room in view."""
-    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), N_FRAMES)
-    pictures = mouse.depths(0, N_FRAMES)
-    return changed(mouse, lambda k, _: pictures[k])
-
-
 def seen(*settings: str) -> BackgroundSubtraction:
     plan = Plan.load("mouse").with_settings(settings)
-    scene, _ = build_scene(on_a_table(), plan, Skeleton.load("mouse"), N_FRAMES)
+    scene, _ = build_scene(shown(on_a_table(N_FRAMES)[1]), plan, Skeleton.load("mouse"), N_FRAMES)
     assert isinstance(scene, BackgroundSubtraction)
     return scene
 

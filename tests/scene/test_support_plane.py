@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from liex_lab.errors import EstimationError
-from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import find_floor
-from liex_lab.scene.outline import find_arena
-from liex_lab.scene.scene import LARGEST
+from liex_lab.scene.scene import LARGEST, find_arena
 from liex_lab.simulation.scenes.catalogue import film
-from tests.scene.staged import changed, stage, walk
+from tests.scene.staged import on_a_table, shown, stage, walk
 
 SPINES = (40.0, 115.0)
 N_FRAMES = 24
@@ -33,7 +31,6 @@ STAGES: dict[str, dict[str, Any]] = {
         "wall_mm": 150.0,
         "raised_mm": 30.0,
     },
-    "an arena on a table": {"height_mm": 700.0, "raised_mm": 480.0},
     "a platform without walls": {"height_mm": 700.0, "wall_mm": 0.0, "raised_mm": 480.0},
     "a platform seen at 35 degrees": {
         "height_mm": 700.0,
@@ -44,21 +41,17 @@ STAGES: dict[str, dict[str, Any]] = {
 }
 
 
-def check(recording: Recording, truth, scene: BackgroundSubtraction, sample) -> None:
-    assert scene.floor.distance_mm == pytest.approx(truth.floor.distance_mm, abs=3.0)
-    angle = np.degrees(np.arccos(np.clip(scene.floor.normal @ truth.floor.normal, -1, 1)))
+@pytest.mark.parametrize("name", ["an arena on a table", *STAGES])
+def test_the_floor_is_where_the_mouse_walks(name):
+    mouse = walk(stage(**STAGES[name]), N_FRAMES) if name in STAGES else on_a_table()[0]
+    scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    assert scene.floor.distance_mm == pytest.approx(mouse.floor.distance_mm, abs=3.0)
+    angle = np.degrees(np.arccos(np.clip(scene.floor.normal @ mouse.floor.normal, -1, 1)))
     assert angle < 0.5
     crops = scene.extract(sample, 1.0)
     assert crops.found.mean() > 0.9
-    off = scene.middles(crops)[crops.found] - truth.joints_arena.mean(axis=1)[crops.found]
+    off = scene.middles(crops)[crops.found] - mouse.joints_arena.mean(axis=1)[crops.found]
     assert np.median(np.linalg.norm(off[:, :2], axis=1)) < 25.0
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_the_floor_is_where_the_mouse_walks(name):
-    mouse = walk(stage(**STAGES[name]), N_FRAMES)
-    scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
-    check(mouse, mouse, scene, sample)
     assert scene.support_plane is not None
     assert scene.support_plane.support > 0.8
     assert not scene.support_plane.doubt
@@ -77,8 +70,7 @@ def test_an_arena_whose_floor_lies_a_little_above_the_bench_has_its_own_plane(ti
 
 
 def test_an_arena_on_a_table_has_its_own_outline_and_nothing_else_is_looked_at():
-    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), N_FRAMES)
-    scene, _ = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    scene, _ = BackgroundSubtraction.learn(shown(on_a_table()[1]), SPINES, N_FRAMES)
     arena = find_arena(scene.background, scene.floor, scene.camera)
     assert arena.kind == "rectangular"
     np.testing.assert_allclose(np.array(arena.half_mm), 150.0, atol=4.0)
@@ -88,9 +80,9 @@ def test_an_arena_on_a_table_has_its_own_outline_and_nothing_else_is_looked_at()
 
 def test_a_glossy_floor_with_holes_is_still_the_floor():
     rng = np.random.default_rng(3)
-    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), N_FRAMES)
     holes = rng.random((240, 320)) < 0.25
-    glossy = changed(mouse, lambda _, depth: np.where(holes & (depth > 600.0), 0, depth))
+    depths = on_a_table()[1]
+    glossy = shown(np.where(holes & (depths > 600.0), np.float32(0), depths))
     scene, sample = BackgroundSubtraction.learn(glossy, SPINES, N_FRAMES)
     assert scene.floor.distance_mm == pytest.approx(700.0, abs=3.0)
     assert scene.extract(sample, 1.0).found.mean() > 0.9
@@ -111,16 +103,18 @@ def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
 
 def test_where_nothing_moves_the_walled_ground_is_taken_and_said_to_be_in_doubt():
     from liex_lab.body.skeleton import MOUSE_VIEW
-    from liex_lab.scene.support_plane import SampledScene, SupportPlane, find_support_plane
+    from liex_lab.scene.background import SampledScene, TargetAnimal
+    from liex_lab.scene.support_plane import SupportPlane, find_support_plane
 
     def stood_on(frames: np.ndarray, still: np.ndarray) -> SupportPlane:
         spread = np.zeros_like(still)
-        scene = SampledScene(frames, still, spread, mouse.camera, SPINES, 7.0, MOUSE_VIEW)
+        target = TargetAnimal(SPINES, 7.0, MOUSE_VIEW)
+        scene = SampledScene(frames, still, spread, still, mouse.camera, target)
         return find_support_plane(scene)
 
-    still = stage(height_mm=700.0, raised_mm=480.0).still
+    mouse = on_a_table()[0]
+    still = mouse.scene.still
     empty = np.tile(still, (6, 1, 1))
-    mouse = walk(stage(height_mm=700.0, raised_mm=480.0), 2)
     found = stood_on(empty, still)
     assert found.floor.distance_mm == pytest.approx(700.0, abs=2.0)
     assert "no object of an animal's size moved" in found.doubt
@@ -132,9 +126,8 @@ def test_where_nothing_moves_the_walled_ground_is_taken_and_said_to_be_in_doubt(
 
 def test_a_scene_in_which_nothing_is_flat_is_refused_in_one_sentence():
     rng = np.random.default_rng(0)
-    mouse = walk(stage(), 4)
     rubble = rng.uniform(400.0, 900.0, (240, 320)).astype(np.float32)
-    rough = changed(mouse, lambda k, depth: rubble)
+    rough = shown(np.tile(rubble, (4, 1, 1)))
     with pytest.raises(EstimationError, match="no floor was found"):
         BackgroundSubtraction.learn(rough, SPINES, 4)
 

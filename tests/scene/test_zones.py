@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone, read_zones, zone_names
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)

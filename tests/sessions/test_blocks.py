@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.tables import rows as rows_module
 from liex_lab.tables import schema

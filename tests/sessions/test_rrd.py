@@ -19,7 +19,7 @@ from liex_lab.body.surface import Surface
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.timestamps import find_gaps, median_step
-from liex_lab.scene.outline import Arena
+from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions import SessionWriter
 from liex_lab.sessions.rrd_scene import BODY, body_parts

@@ -23,7 +23,7 @@ from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import find_gaps
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.outline import UNKNOWN, Arena
+from liex_lab.scene.scene import UNKNOWN, Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Provenance, Session, SessionWriter
 from liex_lab.sessions.provenance import SCHEMA_VERSION
