@@ -291,8 +291,8 @@ def build_scene(
         PlanError: the plan states a region or a floor for a hand.
     """
     from liex_lab.body.skeleton import FOREGROUNDS
-    from liex_lab.scene.background_segmenter import BackgroundSubtraction
     from liex_lab.scene.hand_segmenter import HandSegmenter
+    from liex_lab.scene.learning import learn_scene
 
     animal = animal_of(plan)
     foreground = plan.foreground
@@ -308,7 +308,7 @@ def build_scene(
             recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
         )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
-    return BackgroundSubtraction.learn(
+    return learn_scene(
         recording, sizes, n_frames, foreground.min_height_mm, skeleton.view, floor, region
     )
 

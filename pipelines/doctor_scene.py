@@ -77,7 +77,7 @@ class SceneLook:
 
     def at_scene(self) -> None:
         """Inspect floor, noise, arena, water and animal; fills facts and problems."""
-        from liex_lab.scene.background import SampledScene
+        from liex_lab.scene.background import sampled_scene
 
         grid = self.seen.camera.every(self.stride)
         try:
@@ -90,7 +90,7 @@ class SceneLook:
             self._region = region[:: self.stride, :: self.stride]
             self.sample = self.sample * self._region
         self._floor = stated
-        scene = SampledScene.learn(self.sample, grid, target_of(self.plan))
+        scene = sampled_scene(self.sample, grid, target_of(self.plan))
         background = scene.background
         try:
             support_plane = find_support_plane(
@@ -166,7 +166,7 @@ class SceneLook:
     def _at_animal(self, background: NDArray[np.float32]) -> None:
         """Find the animal as a run would, or else an object of another size."""
         from liex_lab.scene.background import sampled
-        from liex_lab.scene.background_segmenter import BackgroundSubtraction
+        from liex_lab.scene.learning import learn_scene
 
         animal = animal_of(self.plan)
         foreground = self.plan.foreground
@@ -183,7 +183,7 @@ class SceneLook:
         for factor in (1.0, _WIDER):
             sizes = (expected[0] / factor, expected[1] * factor)
             try:
-                scene, sample = BackgroundSubtraction.learn(
+                scene, sample = learn_scene(
                     memory,
                     sizes,
                     len(self.sample),

@@ -19,7 +19,12 @@ from liex_lab.recordings.frame import region_mask
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.scene import plane_of
-from liex_lab.scene.support_plane import arenas_apart, find_support_plane
+from liex_lab.scene.support_plane import (
+    SampledScene,
+    TargetAnimal,
+    arenas_apart,
+    find_support_plane,
+)
 from liex_lab.scene.zones import Corners, region_corners_px
 
 from .origin import animal_of
@@ -27,8 +32,6 @@ from .origin import animal_of
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from liex_lab.scene.background import SampledScene, TargetAnimal
 
 
 _N_SAMPLED = 96
@@ -99,17 +102,15 @@ def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
 
 def _sampled(recording: Recording, plan: Plan) -> tuple[SampledScene, int]:
     """Frames spread over a recording with their background, and the stride of their pixels."""
-    from liex_lab.scene.background import SampledScene, sample_frames, stride_for
+    from liex_lab.scene.background import sample_frames, sampled_scene, stride_for
 
     stride = stride_for(recording, animal_of(plan).spine_min_mm)
     sample = sample_frames(recording, _N_SAMPLED, stride)
-    return SampledScene.learn(sample, recording.camera.every(stride), target_of(plan)), stride
+    return sampled_scene(sample, recording.camera.every(stride), target_of(plan)), stride
 
 
 def target_of(plan: Plan) -> TargetAnimal:
     """The animal of a plan as it is searched for in depth images."""
-    from liex_lab.scene.background import TargetAnimal
-
     animal = animal_of(plan)
     return TargetAnimal(
         (animal.spine_min_mm, animal.spine_max_mm),

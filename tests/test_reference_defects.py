@@ -26,6 +26,7 @@ from liex_lab.recordings import open_recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import Patches
+from liex_lab.scene.learning import learn_scene
 from liex_lab.simulation.species import BY_NAME
 from tests.behaviour.test_kinematics import tables_of
 from tests.oracles.plate import Plate
@@ -74,7 +75,7 @@ def measured(
         [] if water is None else [f"water.{key}={value}" for key, value in water.to_dict().items()]
     )
     with build_recording(path, Plan().with_settings(told)) as recording:
-        scene, sample = BackgroundSubtraction.learn(recording, (40.0, 115.0))
+        scene, sample = learn_scene(recording, (40.0, 115.0))
         crops = scene.extract(sample, 1.0)
     assert crops.found.all()
     T_camera_arena = scene.floor.T_arena_camera.inverse()

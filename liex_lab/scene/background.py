@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
@@ -26,7 +25,9 @@ from liex_lab.runtime.shapes import check_shapes
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene.floor import Floor, near_plane, parts
 from liex_lab.scene.support_plane import (
+    SampledScene,
     SupportPlane,
+    TargetAnimal,
     find_support_plane,
     levelled,
     still_object,
@@ -388,65 +389,9 @@ def _usual(depths: NDArray[np.float32]) -> NDArray[np.float32]:
 SPREADS = 3.0  # least height of an animal in standard deviations of the background
 
 
-@dataclass(frozen=True)
-class TargetAnimal:
-    """Size and view of the animal to detect.
-
-    Attributes:
-        spine_mm: lengths of the smallest and the largest one, mm.
-        min_height_mm: smaller heights above the background are ignored.
-        view: how such animals are viewed.
-    """
-
-    spine_mm: tuple[float, float]
-    min_height_mm: float
-    view: CameraView
-
-    @property
-    def stands_on_floor(self) -> bool:
-        """Whether it stands on the floor; a floating animal may be in front of anything."""
-        return self.view.frame == VIEWS[0]
-
-    @property
-    def smallest_mm2(self) -> float:
-        """Visible area of the smallest one, mm^2."""
-        return self.view.area[0] * self.spine_mm[0] ** 2
-
-    @property
-    def largest_mm2(self) -> float:
-        """Visible area of the largest one, mm^2."""
-        return self.view.area[1] * self.spine_mm[1] ** 2
-
-
-@dataclass(frozen=True)
-class SampledScene:
-    """Sampled frames of a recording, their background, and the expected animals.
-
-    Attributes:
-        sample: (n, H, W) float32 mm, the frames, 0 where unread.
-        background: (H, W) float32 mm, 0 where unknown.
-        spread: (H, W) float32 mm, its standard deviation.
-        near: (H, W) float32 mm, the nearest usual depth.
-        camera: of these pixels, free of lens distortion.
-        target: the animals.
-    """
-
-    sample: Depths
-    background: Depths
-    spread: Depths
-    near: Depths
-    camera: Camera
-    target: TargetAnimal
-
-    @staticmethod
-    def learn(sample: Depths, camera: Camera, target: TargetAnimal) -> SampledScene:
-        """The scene of sampled frames; see `SampledScene` for the arguments."""
-        return SampledScene(sample, *learn_background(sample), camera, target)
-
-    @property
-    def least_ground_mm2(self) -> float:
-        """Area of the smallest ground that such an animal can stand on, mm^2."""
-        return 4.0 * self.target.smallest_mm2
+def sampled_scene(sample: Depths, camera: Camera, target: TargetAnimal) -> SampledScene:
+    """The scene of sampled frames with its background; see `SampledScene` for the arguments."""
+    return SampledScene(sample, *learn_background(sample), camera, target)
 
 
 @dataclass(frozen=True)
@@ -481,7 +426,7 @@ class BareGround:
         Raises:
             EstimationError: no depth was read, no depth recurs often enough, or no floor was found.
         """
-        scene = SampledScene.learn(sample, camera, target)
+        scene = sampled_scene(sample, camera, target)
         _check_background(sample, scene.background)
         plane = find_support_plane(scene, stated)
         if region is not None:

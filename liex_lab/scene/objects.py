@@ -12,18 +12,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.scene.background_segmenter import BackgroundSubtraction as Scene
 from liex_lab.scene.floor import parts
 from liex_lab.scene.scene import HIGH_MM, LEAST_MM2, Fixture, fixture_at
-
-if TYPE_CHECKING:
-    from liex_lab.scene.background import TargetAnimal
-    from liex_lab.scene.background_segmenter import BackgroundSubtraction as Scene
+from liex_lab.scene.support_plane import TargetAnimal
 
 # the scene with an animal's area, the share of frames that show it, and whether it is like one
 Resting: TypeAlias = "tuple[Scene, float, bool]"

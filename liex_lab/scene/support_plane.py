@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.skeleton import VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.threads import side_by_side
@@ -32,9 +32,6 @@ from liex_lab.scene.floor import (
     floor_region,
 )
 from liex_lab.scene.scene import BY_SUPPORT, LARGEST, STATED, WALLED
-
-if TYPE_CHECKING:
-    from liex_lab.scene.background import SampledScene
 
 Array = NDArray[np.float64]
 
@@ -125,6 +122,62 @@ class MovingObject:
         """Whether it stands on a patch (H, W) bool of a floor."""
         share = float(patch[self.rows, self.columns].mean())
         return self.stands_on(floor) and share > _ON_SHARE
+
+
+@dataclass(frozen=True)
+class TargetAnimal:
+    """Size and view of the animal to detect.
+
+    Attributes:
+        spine_mm: lengths of the smallest and the largest one, mm.
+        min_height_mm: smaller heights above the background are ignored.
+        view: how such animals are viewed.
+    """
+
+    spine_mm: tuple[float, float]
+    min_height_mm: float
+    view: CameraView
+
+    @property
+    def stands_on_floor(self) -> bool:
+        """Whether it stands on the floor; a floating animal may be in front of anything."""
+        return self.view.frame == VIEWS[0]
+
+    @property
+    def smallest_mm2(self) -> float:
+        """Visible area of the smallest one, mm^2."""
+        return self.view.area[0] * self.spine_mm[0] ** 2
+
+    @property
+    def largest_mm2(self) -> float:
+        """Visible area of the largest one, mm^2."""
+        return self.view.area[1] * self.spine_mm[1] ** 2
+
+
+@dataclass(frozen=True)
+class SampledScene:
+    """Sampled frames of a recording, their background, and the expected animals.
+
+    Attributes:
+        sample: (n, H, W) float32 mm, the frames, 0 where unread.
+        background: (H, W) float32 mm, 0 where unknown.
+        spread: (H, W) float32 mm, its standard deviation.
+        near: (H, W) float32 mm, the nearest usual depth.
+        camera: of these pixels, free of lens distortion.
+        target: the animals.
+    """
+
+    sample: NDArray[np.float32]
+    background: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    near: NDArray[np.float32]
+    camera: Camera
+    target: TargetAnimal
+
+    @property
+    def least_ground_mm2(self) -> float:
+        """Area of the smallest ground that such an animal can stand on, mm^2."""
+        return 4.0 * self.target.smallest_mm2
 
 
 def find_support_plane(scene: SampledScene, stated: Floor | None = None) -> SupportPlane:

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import cv2
 import numpy as np
@@ -16,9 +16,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_shapes
 from liex_lab.runtime.threads import side_by_side
 from liex_lab.scene.floor import Floor, components
-
-if TYPE_CHECKING:
-    from liex_lab.scene.background import TargetAnimal
+from liex_lab.scene.support_plane import TargetAnimal
 
 Depths = NDArray[np.float32]
 Mask = NDArray[np.bool_]

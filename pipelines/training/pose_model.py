@@ -399,7 +399,7 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> Tra
     """
     from liex_lab.body.skeleton import FOREGROUNDS
     from liex_lab.estimation.training import TrainingSet
-    from liex_lab.scene.background_segmenter import SPREADS
+    from liex_lab.scene.background import SPREADS
     from liex_lab.scene.hand_segmenter import HandPatches
     from liex_lab.scene.height_maps import Patches
 

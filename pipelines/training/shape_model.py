@@ -187,7 +187,7 @@ def _measured(
 
 def _cut(estimator: PoseEstimator, windows: TrainingPatches) -> tuple[HeightMaps, Array]:
     """Height maps of the animals in patches, segmented as in a run."""
-    from liex_lab.scene.background_segmenter import SPREADS
+    from liex_lab.scene.background import SPREADS
     from liex_lab.scene.height_maps import Patches
 
     skeleton = estimator.skeleton

@@ -11,6 +11,7 @@ from liex_lab.pipelines.origin import build_background
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.learning import learn_scene
 from liex_lab.sessions.cutouts import still_scene
 from tests.scene.test_background_segmenter import (
     CAMERA,
@@ -48,7 +49,7 @@ def coarser(scene: BackgroundSubtraction, stride: int) -> BackgroundSubtraction:
 @pytest.mark.parametrize("stride", [1, 3, 4])
 def test_an_animal_that_sleeps_most_of_the_time_leaves_no_ghost(stride: int) -> None:
     recording = sleeper()
-    known, _ = BackgroundSubtraction.learn(recording, SPINES)
+    known, _ = learn_scene(recording, SPINES)
     assert (off(still_scene(recording)) > HEIGHT_MM - NOISE_MM).sum() > 300, "16 frames hold it"
     background = build_background(recording, Plan.load("mouse"), coarser(known, stride))
     assert background is not None
@@ -57,7 +58,7 @@ def test_an_animal_that_sleeps_most_of_the_time_leaves_no_ghost(stride: int) -> 
 
 def test_a_scene_without_a_ghost_is_as_it_was_learned() -> None:
     recording = sleeper(n_awake=60)
-    known, _ = BackgroundSubtraction.learn(recording, SPINES)
+    known, _ = learn_scene(recording, SPINES)
     np.testing.assert_array_equal(still_scene(recording, known), still_scene(recording))
 
 
@@ -81,7 +82,7 @@ def test_what_is_larger_than_any_animal_stays_where_only_the_bare_floor_is_known
 
 def test_where_no_depth_is_kept_or_all_of_it_there_is_no_scene() -> None:
     recording = sleeper()
-    known, _ = BackgroundSubtraction.learn(recording, SPINES)
+    known, _ = learn_scene(recording, SPINES)
     for kept in ("none", "all"):
         plan = Plan.load("mouse").with_settings([f"replay.depth={kept}"])
         assert build_background(recording, plan, known) is None

@@ -8,6 +8,7 @@ import pytest
 from liex_lab.optics.camera import Camera
 from liex_lab.scene.background import FloorLevel, SceneChange, wandering
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.learning import learn_scene
 from tests.scene.staged import altered, walked
 
 SPINES = (40.0, 115.0)
@@ -20,7 +21,7 @@ def learned(wander_mm: float) -> tuple[BackgroundSubtraction, np.ndarray]:
     warm = altered(
         walked()[1][:N_FRAMES], lambda k, d: np.where(d > 0, d + np.float32(off[k]), np.float32(0))
     )
-    scene, _ = BackgroundSubtraction.learn(warm, SPINES, N_FRAMES)
+    scene, _ = learn_scene(warm, SPINES, N_FRAMES)
     depths = np.stack([warm.frame(k).depth for k in range(N_FRAMES)])
     return scene, scene.extract(depths, 1.0).centroid[:, 2]
 
@@ -64,7 +65,7 @@ TIMES = np.arange(N_CHANGED) / 30.0
 
 
 def learned_from(change) -> BackgroundSubtraction:
-    return BackgroundSubtraction.learn(altered(walked()[1], change), SPINES, N_CHANGED)[0]
+    return learn_scene(altered(walked()[1], change), SPINES, N_CHANGED)[0]
 
 
 def test_a_scene_that_keeps_still_is_not_doubted() -> None:

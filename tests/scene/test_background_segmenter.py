@@ -17,6 +17,7 @@ from liex_lab.scene._height_map_kernels import AREA_FACTOR, order_blobs
 from liex_lab.scene.background import learn_background
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor, find_floor
+from liex_lab.scene.learning import learn_scene
 
 CAMERA = Camera(300.0, 300.0, 79.5, 59.5, 160, 120)
 SPINES = (40.0, 115.0)
@@ -92,7 +93,7 @@ def test_the_background_survives_a_pixel_that_is_covered_most_of_the_time(frames
 
 def test_an_animal_that_never_moves_is_found_against_the_floor():
     recording = recording_of([with_box(tilted(2.0), (60, 60))] * 20)
-    scene, sample = BackgroundSubtraction.learn(recording, SPINES)
+    scene, sample = learn_scene(recording, SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
     u = crops.origin[:, 0] + 48
@@ -107,7 +108,7 @@ def test_the_animal_is_told_from_a_larger_thing_that_comes_and_goes():
         if k % 2:
             frame[80:116, 20:100] -= 60.0
         frames.append(frame)
-    scene, sample = BackgroundSubtraction.learn(recording_of(frames), SPINES)
+    scene, sample = learn_scene(recording_of(frames), SPINES)
     crops = scene.extract(sample, 1.0)
     centre = crops.origin[:, 0] + 48
     assert crops.found.all()
@@ -192,7 +193,7 @@ def test_a_recording_that_shows_no_background_is_told_why(n: int, depth_mm: int,
         read=lambda row: pictures,
     )
     with pytest.raises(EstimationError, match=says):
-        BackgroundSubtraction.learn(still, (40.0, 115.0))
+        learn_scene(still, (40.0, 115.0))
 
 
 # Which of the components of a picture is likest to the animal.

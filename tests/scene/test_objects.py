@@ -11,6 +11,7 @@ from liex_lab.optics.camera import SensorCard
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.learning import learn_scene
 from liex_lab.scene.scene import Fixture
 from tests.scene.test_background_segmenter import CAMERA, SPINES, recording_of, tilted, with_box
 
@@ -31,9 +32,7 @@ def nodding(k: int) -> np.ndarray:
 
 @pytest.mark.parametrize("n_frames", [20, 60])
 def test_an_animal_that_only_turns_its_head_is_found_whole(n_frames):
-    scene, sample = BackgroundSubtraction.learn(
-        recording_of([nodding(k) for k in range(n_frames)]), SPINES
-    )
+    scene, sample = learn_scene(recording_of([nodding(k) for k in range(n_frames)]), SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
     whole = BackgroundSubtraction.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
@@ -54,7 +53,7 @@ def test_an_animal_that_goes_from_where_the_floor_is_never_read_was_whole_before
         return there
 
     frames = [frame(k) for k in range(40)]
-    scene, sample = BackgroundSubtraction.learn(recording_of(frames), SPINES)
+    scene, sample = learn_scene(recording_of(frames), SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
     whole = BackgroundSubtraction.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
@@ -70,7 +69,7 @@ def test_where_nothing_moves_the_floor_is_what_the_animal_lies_on(step_mm):
     around = np.ones(frame.shape, bool)
     around[18:104, 20:118] = False
     frame[around] = bench[around]
-    scene, sample = BackgroundSubtraction.learn(recording_of([frame] * 20), SPINES)
+    scene, sample = learn_scene(recording_of([frame] * 20), SPINES)
     assert scene.floor.distance_mm == pytest.approx(floor.distance_mm, abs=0.6)
     assert scene.extract(sample, 1.0).found.all()
 
@@ -81,7 +80,7 @@ def test_of_what_stands_still_in_a_noisy_picture_the_animal_is_what_changes(seed
     recording = open_recording(
         f"synthetic:walk?seed={seed}&frames={n_frames}&sensor=primesense-qvga"
     )
-    scene, sample = BackgroundSubtraction.learn(recording, SPINES)
+    scene, sample = learn_scene(recording, SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
     true = cast("TrueRecording", recording).joints_arena
@@ -109,7 +108,7 @@ def with_thing(frame: np.ndarray, high: float = 60.0) -> np.ndarray:
 
 
 def transient_objects(frames: list[np.ndarray]) -> list[Fixture]:
-    scene, _ = BackgroundSubtraction.learn(recording_of(frames), SPINES)
+    scene, _ = learn_scene(recording_of(frames), SPINES)
     return [
         one
         for one in scene.described().fixtures
@@ -190,7 +189,7 @@ def card_of(frames: list[np.ndarray]) -> SensorCard:
         times_ns=np.arange(len(frames)) * 33_000_000,
         read=lambda k: frames[k],
     )
-    scene, _ = BackgroundSubtraction.learn(recording, SPINES)
+    scene, _ = learn_scene(recording, SPINES)
     assert scene.sensor is not None
     return scene.sensor
 

@@ -10,6 +10,7 @@ import pytest
 from liex_lab.errors import EstimationError
 from liex_lab.scene.background import learn_background
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.learning import learn_scene
 from tests.scene.staged import shown, walked
 
 SPINES = (40.0, 115.0)
@@ -31,7 +32,7 @@ def filmed() -> tuple[np.ndarray, np.ndarray]:
 
 
 def found(pictures: np.ndarray) -> tuple[BackgroundSubtraction, np.ndarray]:
-    scene, sample = BackgroundSubtraction.learn(shown(pictures), SPINES, N_FRAMES)
+    scene, sample = learn_scene(shown(pictures), SPINES, N_FRAMES)
     return scene, scene.extract(sample, 1.0).found
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from liex_lab.errors import EstimationError
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import find_floor
+from liex_lab.scene.learning import learn_scene
 from liex_lab.scene.scene import LARGEST, find_arena
 from liex_lab.simulation.scenes.catalogue import film
 from tests.scene.staged import on_a_table, shown, stage, walk
@@ -44,7 +44,7 @@ STAGES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("name", ["an arena on a table", *STAGES])
 def test_the_floor_is_where_the_mouse_walks(name):
     mouse = walk(stage(**STAGES[name]), N_FRAMES) if name in STAGES else on_a_table()[0]
-    scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    scene, sample = learn_scene(mouse, SPINES, N_FRAMES)
     assert scene.floor.distance_mm == pytest.approx(mouse.floor.distance_mm, abs=3.0)
     angle = np.degrees(np.arccos(np.clip(scene.floor.normal @ mouse.floor.normal, -1, 1)))
     assert angle < 0.5
@@ -63,14 +63,14 @@ def test_an_arena_whose_floor_lies_a_little_above_the_bench_has_its_own_plane(ti
     mouse = walk(stage(height_mm=700.0, raised_mm=6.0, wall_mm=60.0, tilt_deg=tilt_deg), N_FRAMES)
     between = find_floor(np.asarray(mouse.scene.still), mouse.camera)
     assert abs(between.distance_mm - mouse.floor.distance_mm) > 2.0
-    scene, _ = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    scene, _ = learn_scene(mouse, SPINES, N_FRAMES)
     assert scene.floor.distance_mm == pytest.approx(mouse.floor.distance_mm, abs=1.2)
     angle = np.degrees(np.arccos(np.clip(scene.floor.normal @ mouse.floor.normal, -1, 1)))
     assert angle < 0.3
 
 
 def test_an_arena_on_a_table_has_its_own_outline_and_nothing_else_is_looked_at():
-    scene, _ = BackgroundSubtraction.learn(shown(on_a_table()[1]), SPINES, N_FRAMES)
+    scene, _ = learn_scene(shown(on_a_table()[1]), SPINES, N_FRAMES)
     arena = find_arena(scene.background, scene.floor, scene.camera)
     assert arena.kind == "rectangular"
     np.testing.assert_allclose(np.array(arena.half_mm), 150.0, atol=4.0)
@@ -83,14 +83,14 @@ def test_a_glossy_floor_with_holes_is_still_the_floor():
     holes = rng.random((240, 320)) < 0.25
     depths = on_a_table()[1]
     glossy = shown(np.where(holes & (depths > 600.0), np.float32(0), depths))
-    scene, sample = BackgroundSubtraction.learn(glossy, SPINES, N_FRAMES)
+    scene, sample = learn_scene(glossy, SPINES, N_FRAMES)
     assert scene.floor.distance_mm == pytest.approx(700.0, abs=3.0)
     assert scene.extract(sample, 1.0).found.mean() > 0.9
 
 
 def test_in_an_ordinary_scene_the_floor_is_the_largest_plane_to_the_last_bit():
     mouse = walk(stage((250.0, 200.0), height_mm=700.0, room=False), N_FRAMES)
-    scene, sample = BackgroundSubtraction.learn(mouse, SPINES, N_FRAMES)
+    scene, sample = learn_scene(mouse, SPINES, N_FRAMES)
     from liex_lab.scene.background import learn_background
 
     present = find_floor(learn_background(sample)[0], mouse.camera)
@@ -129,14 +129,14 @@ def test_a_scene_in_which_nothing_is_flat_is_refused_in_one_sentence():
     rubble = rng.uniform(400.0, 900.0, (240, 320)).astype(np.float32)
     rough = shown(np.tile(rubble, (4, 1, 1)))
     with pytest.raises(EstimationError, match="no floor was found"):
-        BackgroundSubtraction.learn(rough, SPINES, 4)
+        learn_scene(rough, SPINES, 4)
 
 
 @pytest.mark.parametrize("seed", [2027, 2048])
 def test_the_back_of_a_mouse_on_unread_floor_is_no_ground(seed: int) -> None:
     """It keeps still but for its head, and all around it the glossy floor is unread."""
     recording = film("glossy", seed, 120, family="train" if seed % 2 == 0 else "other")
-    scene, _ = BackgroundSubtraction.learn(recording, (40.0, 110.0))
+    scene, _ = learn_scene(recording, (40.0, 110.0))
     assert scene.support_plane is not None
     assert scene.support_plane.origin == LARGEST
     assert scene.support_plane.floor.distance_mm == pytest.approx(

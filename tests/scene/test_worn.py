@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from liex_lab.optics.camera import Camera
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
+from liex_lab.scene.learning import learn_scene
 from liex_lab.scene.worn import Cable, HeadStage
 from tests.scene.staged import shown, walked
 
@@ -163,7 +163,7 @@ def test_a_head_stage_is_found_where_an_animal_wears_one_and_not_where_it_does_n
 
 
 def test_mice_that_walk_and_rear_wear_no_head_stage() -> None:
-    assert BackgroundSubtraction.learn(shown(walked()[1]), (40.0, 115.0), 60)[0].worn == ()
+    assert learn_scene(shown(walked()[1]), (40.0, 115.0), 60)[0].worn == ()
 
 
 def test_without_its_head_stage_the_animal_looks_as_before() -> None:

@@ -11,7 +11,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.learning import learn_scene
 from liex_lab.simulation import training_patches
 from liex_lab.simulation.generic import GenericSpecies, draw_angles, moving_session
 from liex_lab.simulation.recording import SyntheticSession
@@ -142,9 +142,7 @@ def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it
     skeleton, species = world.skeleton, world.species  # type: ignore[attr-defined]
     recording = SyntheticSession.draw([13, 2], 20, species=species)
     spans = (0.6 * skeleton.length, 1.5 * skeleton.length)
-    scene, sample = BackgroundSubtraction.learn(
-        recording, spans, 20, skeleton.view.min_height_mm, skeleton.view
-    )
+    scene, sample = learn_scene(recording, spans, 20, skeleton.view.min_height_mm, skeleton.view)
     assert scene.stride == (2 if animal == "fish" else 1)
     crops = scene.extract(sample, recording.spine_mm / skeleton.length, camera_view=species.floats)
     assert crops.found.mean() > 0.9
