@@ -260,7 +260,7 @@ def test_zones_are_drawn_in_a_file_that_the_plan_names(folder, session, tmp_path
 
 
 def test_a_slip_in_the_zones_is_told_before_any_work(folder, tmp_path, monkeypatch):
-    learn = "liex_lab.scene.background_segmenter.BackgroundSubtraction.learn"
+    learn = "liex_lab.scene.learning.learn_scene"
     monkeypatch.setattr(learn, lambda *_: pytest.fail("work was begun"))
     plan = Plan.load("mouse").with_settings([f"arena.zones={tmp_path / 'none.toml'}"])
     with pytest.raises(PlanError, match=r"there is no file .*none\.toml"):
