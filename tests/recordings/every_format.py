@@ -60,7 +60,7 @@ class Format:
     and return what to open. survivors: given a file and its first damaged byte, the frames that
     must still come out exactly; None where the recording may be refused. atol_mm: how far depth may
     be from what was written. streams: its file is large, and so must never be read at once.
-    n_damaged: variants of it that are tried. promise: change the header to one that promises 2^31
+    promise: change the header to one that promises 2^31
     frames, where it counts them.
     """
 
@@ -69,7 +69,6 @@ class Format:
     survivors: Survivors
     atol_mm: float = 0.0
     streams: bool = True
-    n_damaged: int = 200
     promise: Callable[[Path], None] | None = None
 
 
@@ -272,8 +271,8 @@ FORMATS = (
         "azure-mkv", lambda f, s: write_video_session(f, s, "depth.mkv"), before(_mkv_ends, ".mkv")
     ),
     Format("oni-16zT", _oni("16zT"), before(_oni_ends, ".oni"), promise=_promise_oni),
-    Format("oni-16zP", _oni("16zP"), before(_oni_ends, ".oni"), n_damaged=60),
-    Format("oni-old", _old_oni, before(_oni_ends, ".oni"), n_damaged=60),
+    Format("oni-16zP", _oni("16zP"), before(_oni_ends, ".oni")),
+    Format("oni-old", _old_oni, before(_oni_ends, ".oni")),
     Format(
         "mcap-foxglove",
         lambda f, s: write_mcap(f / "recording.mcap", s),
@@ -283,19 +282,16 @@ FORMATS = (
         "mcap-unchunked",
         lambda f, s: write_mcap(f / "recording.mcap", s, use_chunks=False),
         before(_mcap_message_ends, ".mcap"),
-        n_damaged=60,
     ),
     Format(
         "mcap-png",
         lambda f, s: write_mcap(f / "recording.mcap", s, encoding="png", chunk_size=4096),
         before(_mcap_message_ends, ".mcap"),
-        n_damaged=60,
     ),
     Format(
         "mcap-ros1",
         lambda f, s: write_ros_mcap(f / "recording.mcap", s, 1, compression=CompressionType.NONE),
         before(_mcap_message_ends, ".mcap"),
-        n_damaged=60,
     ),
     Format(
         "mcap-ros2",
@@ -303,7 +299,6 @@ FORMATS = (
             f / "recording.mcap", s, 2, kind="rvl", compression=CompressionType.LZ4, chunk_size=4096
         ),
         before(_mcap_message_ends, ".mcap"),
-        n_damaged=60,
     ),
     Format("bag-lz4", lambda f, s: write_bag(f / "recording.bag", s), before(_bag_ends, ".bag")),
     Format(
@@ -312,7 +307,6 @@ FORMATS = (
             f / "recording.bag", s, compression="bz2", kind="png", chunk_bytes=4096
         ),
         before(_bag_ends, ".bag"),
-        n_damaged=60,
     ),
     Format(
         "bag-plain",
@@ -320,7 +314,6 @@ FORMATS = (
             f / "recording.bag", s, compression=None, chunk_bytes=1 << 18, kind="rvl"
         ),
         before(_bag_ends, ".bag"),
-        n_damaged=60,
     ),
     # SQLite keeps its tables in pages of a tree, so that nothing is promised of what comes before
     Format("ros2-db3", lambda f, s: write_db3(f / "bag", s), lambda path, at: None),

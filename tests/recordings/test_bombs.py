@@ -51,13 +51,9 @@ def bounded(work: Callable[[], object], says: str, kind: type[LiexError] = Recor
 
 
 def zeros_gz(path: Path, head: bytes, n_zeros: int) -> Path:
-    """A gzip file of some bytes and then zeros, made without holding them."""
-    with gzip.open(path, "wb", compresslevel=6) as out:
-        out.write(head)
-        block = bytes(1 << 22)
-        while n_zeros > 0:
-            out.write(block[:n_zeros])
-            n_zeros -= len(block)
+    """A gzip file of some bytes and then zeros: one member for every 4 MB of them, as gzip may."""
+    member = gzip.compress(bytes(1 << 22))
+    path.write_bytes(gzip.compress(head) + member * (n_zeros >> 22))
     return path
 
 
@@ -92,15 +88,12 @@ def test_depth_of_nothing_but_zeros_is_not_unpacked_for_ever(
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
     (tmp_path / "scratch").mkdir()
-    bomb = zeros_gz(tmp_path / "a.tar.gz", head_of("depth.dat", 1 << 30), 1 << 30)
+    bomb = zeros_gz(tmp_path / "a.tar.gz", head_of("depth.dat", 1 << 30), 5 << 27)
     assert bomb.stat().st_size < 4_000_000
     bounded(lambda: open_recording(bomb), "times its size")
     assert not list((tmp_path / "scratch").iterdir())
-    with gzip.open(tmp_path / "b.tar.gz", "wb") as out:  # behind the end of the tar, too
-        out.write(bytes(1024))
-        for _ in range(160):
-            out.write(bytes(1 << 22))
-    bounded(lambda: open_recording(tmp_path / "b.tar.gz"), r"times its size|nothing can be")
+    ended = zeros_gz(tmp_path / "b.tar.gz", bytes(1024), 5 << 27)  # behind the end of the tar, too
+    bounded(lambda: open_recording(ended), r"times its size|nothing can be")
 
 
 def test_a_file_with_holes_is_not_filled(tmp_path: Path) -> None:
@@ -139,15 +132,8 @@ def test_a_directory_of_pictures_that_leads_back_to_itself_ends(tmp_path: Path) 
 
 @pytest.mark.parametrize("code", [8, 34925])
 def test_a_strip_that_unpacks_to_gigabytes_is_a_damaged_picture(code: int, tmp_path: Path) -> None:
-    n = 1 << 28
-    if code == 8:
-        packer = zlib.compressobj(6)
-        packed = b"".join(packer.compress(bytes(1 << 22)) for _ in range(n >> 22))
-        packed += packer.flush()
-    else:
-        lzma_packer = lzma.LZMACompressor(preset=0)
-        packed = b"".join(lzma_packer.compress(bytes(1 << 22)) for _ in range(n >> 22))
-        packed += lzma_packer.flush()
+    n = 1 << 26
+    packed = zlib.compress(bytes(n)) if code == 8 else lzma.compress(bytes(n), preset=0)
     tags = [
         (256, 4, 1, 320),
         (257, 4, 1, 240),
@@ -167,7 +153,7 @@ def test_a_strip_that_unpacks_to_gigabytes_is_a_damaged_picture(code: int, tmp_p
     stack = open_tiffs([path], silent)
     assert stack.read(0) is None
     stack.close()
-    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024 < MOST_MB
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024 < MOST_MB / 5
 
 
 @pytest.mark.parametrize("name", ["messages", "Topics"])
@@ -194,13 +180,13 @@ def test_a_view_that_never_ends_is_no_table_of_messages(name: str, tmp_path: Pat
     bounded(lambda: open_recording(path), "not stored but worked out")
 
 
-def test_as_many_topics_as_a_file_can_number_are_told_as_fast_as_one(tmp_path: Path) -> None:
+def test_thousands_of_topics_are_told_as_fast_as_one(tmp_path: Path) -> None:
     path = tmp_path / "many.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
         schema = writer.register_schema("x", "jsonschema", b"{}")
-        for k in range((1 << 16) - 1):
+        for k in range(1 << 14):
             writer.register_channel(f"/topic{k}", "json", schema)
         writer.finish()
     bounded(lambda: open_recording(path), "holds no depth pictures: its topics are /topic0 ")
@@ -265,13 +251,10 @@ def array(values: np.ndarray, shape: tuple[int, ...] | None = None) -> bytes:
 
 
 def test_a_model_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "m.npz"
-    with (
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
-        archive.open("head.npy", "w", force_zip64=True) as out,
-    ):
-        for _ in range(260):
-            out.write(bytes(1 << 22))
+    path = npz(tmp_path / "m.npz", {"head": bytes(1 << 20)})
+    content = path.read_bytes()
+    size = (1 << 20).to_bytes(4, "little")
+    path.write_bytes(content.replace(size, (1 << 31).to_bytes(4, "little")))  # as it states
     bounded(lambda: Model.load(path), "unpacks to", ModelError)
 
 

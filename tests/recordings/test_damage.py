@@ -21,6 +21,7 @@ from tests.recordings.every_format import FORMATS, Format
 from tests.recordings.writers import depth_frames
 
 STORED = depth_frames(6)
+FEW = 25  # damaged variants of a format outside the nightly run
 SECONDS = 5  # far more than any takes; a hang otherwise
 
 
@@ -138,8 +139,11 @@ def check(form: Format, whole: Path, opened: Path, done: Damage) -> bool:
         return True
 
 
+@pytest.mark.parametrize("n_damaged", [FEW, pytest.param(200, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.name)
-def test_damaged_variants_give_frames_or_a_sentence(form: Format, tmp_path: Path) -> None:
+def test_damaged_variants_give_frames_or_a_sentence(
+    form: Format, n_damaged: int, tmp_path: Path
+) -> None:
     (tmp_path / "whole").mkdir()
     whole = form.write(tmp_path / "whole", STORED)
     size = sum(file.stat().st_size for file in files_of(whole))
@@ -148,7 +152,7 @@ def test_damaged_variants_give_frames_or_a_sentence(form: Format, tmp_path: Path
     n_opened, failed = 0, []
     shutil.copytree(tmp_path / "whole", tmp_path / "damaged")
     opened = tmp_path / "damaged" / whole.relative_to(tmp_path / "whole")
-    for seed in range(form.n_damaged):
+    for seed in range(n_damaged):
         done = damage(np.random.default_rng([seed, len(form.name)]), opened)
         try:
             with little_time(), little_memory(4 * size + 300_000_000):
@@ -163,9 +167,8 @@ def test_damaged_variants_give_frames_or_a_sentence(form: Format, tmp_path: Path
         sound = tmp_path / "whole" / done.file.relative_to(tmp_path / "damaged")
         done.file.write_bytes(sound.read_bytes())
     assert not failed, "\n".join(failed)
-    assert (
-        0.1 * form.n_damaged < n_opened < form.n_damaged
-    )  # the damage was neither too harsh nor none
+    # the damage was neither too harsh nor none
+    assert 0.1 * n_damaged < n_opened <= n_damaged - (n_damaged > FEW)
 
 
 @pytest.mark.parametrize(

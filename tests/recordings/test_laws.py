@@ -196,7 +196,7 @@ def many(form: Format) -> np.ndarray:
     """Enough frames for a file that must not be read at once; fewer where every picture has a file
     of its own.
     """
-    return depth_frames(600 if form.streams else 40)
+    return depth_frames(300 if form.streams else 24)
 
 
 def test_large_files_are_read_in_parts(
