@@ -19,7 +19,6 @@ from liex_lab.errors import RecordingError, SessionError
 from liex_lab.geometry import SE3
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.depth_kernels import to_millimetres, unpack_rvl
-from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.frame import region_mask
 from liex_lab.sessions import Session, SessionWriter, correcting
 from liex_lab.sessions.checkpoint import append_rrd
@@ -133,23 +132,12 @@ def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
     assert n_unread > 0, "unread pixels stay unread"
 
 
-def test_pictures_are_opened_by_the_index_and_unpacked_when_they_are_wanted(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    unpacked: list[int] = []
-    unpack = McapFile.unpack
-
-    def counting(file: McapFile, number: int) -> memoryview:
-        unpacked.append(number)
-        return unpack(file, number)
-
-    monkeypatch.setattr(McapFile, "unpack", counting)
-    with open_depth(session) as pictures:
-        assert set(unpacked) <= {0}, "what the first messages say lies in the first chunk"
-        assert len(pictures) == len(MOUSE.times_s)
-    with open_recording(session.path / "session.mcap") as walked:
-        np.testing.assert_array_equal(pictures.times_ns, walked.times_ns)
-        assert pictures.camera == walked.camera
+def test_depth_opened_by_the_index_is_that_of_walking_the_file(session: Session) -> None:
+    with open_depth(session) as images, open_recording(session.path / "session.mcap") as walked:
+        assert len(images) == len(MOUSE.times_s)
+        np.testing.assert_array_equal(images.times_ns, walked.times_ns)
+        np.testing.assert_array_equal(images.frame(9).depth, walked.frame(9).depth)
+        assert images.camera == walked.camera
 
 
 def test_of_a_damaged_replay_no_image_is_taken_for_another_one(
