@@ -57,7 +57,9 @@ def written(made: Messages, flush_at: int = 0, **settings: Any) -> io.BytesIO:
 
 def in_order_of_time(file: BinaryIO) -> Messages:
     reader = make_reader(file, validate_crcs=True)
-    return [(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
+    found = [(channel.topic, one.log_time, one.data) for _, channel, one in reader.iter_messages()]
+    file.seek(0)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -73,6 +75,7 @@ def test_every_message_is_found_by_the_index_in_the_order_of_time(settings: dict
     file = written(made, **settings)
     assert in_order_of_time(file) == sorted(made, key=lambda one: one[1])
     summary = make_reader(file).get_summary()
+    file.seek(0)
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == len(made)
@@ -82,7 +85,6 @@ def test_every_message_is_found_by_the_index_in_the_order_of_time(settings: dict
     assert {s.name: s.data for s in summary.schemas.values()} == {
         one.name: one.data for one in (ONE, OTHER)
     }
-    file.seek(0)
     names = [type(one).__name__ for one in StreamReader(file, validate_crcs=True).records]
     assert (names[0], names[-1], names.count("Message")) == ("Header", "Footer", 60)
     assert "Message" not in names[names.index("DataEnd") :]
