@@ -483,21 +483,19 @@ class Thumbnails:
             Its entry as in `save`, and `beside_px`, [u, v] of the centre of the other object; None
             if no kept frame shows one.
         """
-        best: tuple[int, int, NDArray[np.float64]] | None = None
-        for row in self._usable(rows):
-            uv = rows.track.uv_px[row]
-            centre = np.nanmean(uv, axis=0)
-            found = np.asarray(observations.centroid_px[row, ::2], float)  # of both components
-            away = np.linalg.norm(found - centre, axis=1)
-            reach = np.nanmax(np.linalg.norm(uv - centre, axis=1))
-            n_px = observations.n_px[row, ::2]
-            size = int(n_px.min())  # both components should be whole
-            both = (np.isfinite(away) & (n_px > 0)).all() and away.max() >= reach
-            if both and (best is None or size > best[1]):
-                best = row, size, found[int(away.argmax())]
-        if best is None:
+        usable = np.array(self._usable(rows), np.int64)
+        uv = rows.track.uv_px[usable]
+        centre = np.nanmean(uv, axis=1, keepdims=True)
+        found = np.asarray(observations.centroid_px[usable, ::2], float)  # of both components
+        away = np.linalg.norm(found - centre, axis=2)
+        reach = np.nanmax(np.linalg.norm(uv - centre, axis=2), axis=1)
+        size = observations.n_px[usable, ::2].min(axis=1)  # both components should be whole
+        both = np.isfinite(away).all(axis=1) & (size > 0) & (away.max(axis=1) >= reach)
+        if not both.any():
             return None
-        row, _, place = best
+        best = int(np.where(both, size, 0).argmax())
+        row = int(usable[best])
+        place = found[best, away[best].argmax()]
         return {
             **_written(folder, "whole", rows, row, 0, 0, self._kept[row]),
             "beside_px": [round(float(at), 1) for at in place],

@@ -254,15 +254,13 @@ class LiveView:
         self._first_ns = frame.time_ns if self._first_ns is None else self._first_ns
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=np.timedelta64(frame.time_ns - self._first_ns, "ns"))
-        if row.posed[0]:
-            joints_m = row.joints_mm[0] / MM_PER_UNIT
-            bones = [joints_m[list(edge)] for edge in self._edges]
-            self._stream.log(f"{SKELETON}/joints", rr.Points3D(joints_m))
-            self._stream.log(f"{SKELETON}/bones", rr.LineStrips3D(bones))
+        posed = bool(row.posed[0])
+        joints_m = row.joints_mm[0] / MM_PER_UNIT
+        bones = [joints_m[list(edge)] for edge in self._edges]
+        self._stream.log(f"{SKELETON}/joints", rr.Points3D(joints_m if posed else []))
+        self._stream.log(f"{SKELETON}/bones", rr.LineStrips3D(bones if posed else []))
+        if posed:
             self._stream.log(ERROR, rr.Scalars(float(row.predicted_error_mm[0])))
-        else:
-            self._stream.log(f"{SKELETON}/joints", rr.Points3D([]))
-            self._stream.log(f"{SKELETON}/bones", rr.LineStrips3D([]))
         if frame.index % _DEPTH_EVERY == 0:
             depth = np.clip(np.rint(frame.depth), 0, 65535).astype(np.uint16)
             if not self._range:

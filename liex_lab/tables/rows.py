@@ -208,10 +208,16 @@ class Rows:
         observed_rows = np.flatnonzero(observed)
         stops = stop_times(time)
         for start, stop, reason in constant_runs(lost):
-            if reason:
-                span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
-                position = self._last_place(observed_rows, start) if reason == HIDDEN else _NOWHERE
-                found.append((*span, stop - start, str(reason), *position))
+            if not reason:
+                continue
+            span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
+            position = _NOWHERE
+            if reason == HIDDEN and len(observed_rows):
+                # the last observed position before, or the first one after it
+                last = max(0, int(np.searchsorted(observed_rows, start)) - 1)
+                x, y = self.track.centroid_mm[observed_rows[last], :2]
+                position = (float(x), float(y))
+            found.append((*span, stop - start, str(reason), *position))
         found.sort()
         names = (*_SPAN_NAMES, "n_frames_missing", "reason", "x_mm", "y_mm")
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
@@ -258,19 +264,6 @@ class Rows:
                 known = (frame, frame + (not lost), gap.n_frames_missing, gap.reason)
                 found.append((*span, *known, *_NOWHERE))
         return found
-
-    def _last_place(self, observed_rows: NDArray[np.int64], row: int) -> tuple[float, float]:
-        """Last observed position (x, y) mm of the animal before a row, or the first one after it.
-
-        Args:
-            observed_rows: rows with a measured pose, in order.
-            row: the first row of a gap.
-        """
-        if not len(observed_rows):
-            return _NOWHERE
-        last = observed_rows[max(0, int(np.searchsorted(observed_rows, row)) - 1)]
-        x, y = self.track.centroid_mm[last, :2]
-        return float(x), float(y)
 
     @property
     def _who(self) -> dict[str, str]:
