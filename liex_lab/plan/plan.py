@@ -283,14 +283,11 @@ def _unknown(dotted: str) -> str:
     tables = sorted({name.partition(".")[0] for name in known if "." in name})
     elsewhere = [name for name in known if name.rpartition(".")[2] == key]
     beside = [name for name in known if section and name.startswith(f"{section}.")]
-    if not section and not elsewhere and difflib.get_close_matches(key, tables, 1, cutoff=0.7):
-        return f"[{key}] is not a section of a plan; the nearest one is [{_nearest(key, tables)}]"
-    near = elsewhere[0] if elsewhere else _nearest(dotted, beside or known)
-    return f"{dotted} is not a setting of a plan; the nearest one is {near}"
-
-
-def _nearest(word: str, known: list[str]) -> str:
-    return difflib.get_close_matches(word, known, 1, cutoff=0.0)[0]
+    sections = difflib.get_close_matches(key, tables, 1, cutoff=0.7)
+    if not section and not elsewhere and sections:
+        return f"[{key}] is not a section of a plan; the nearest one is [{sections[0]}]"
+    near = elsewhere or difflib.get_close_matches(dotted, beside or known, 1, cutoff=0.0)
+    return f"{dotted} is not a setting of a plan; the nearest one is {near[0]}"
 
 
 def _sentence(error: ValidationError) -> str:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -374,31 +373,29 @@ def merged(table: Settings, settings: Settings) -> Settings:
     return out
 
 
+_MODELS: dict[str, type[SettingsTable]] = {
+    "animals": StudyAnimal,
+    "arenas": StudyArena,
+    "sessions": StudySession,
+}
+
+
 def _sentence(error: ValidationError) -> str:
     """The first validation error as one sentence with advice."""
     first, *others = error.errors(include_url=False)
     more = f" (and {len(others)} more)" if others else ""
-    where = "".join(
-        f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in first["loc"]
-    ).lstrip(".")
+    parts = [f"[{part + 1}]" if isinstance(part, int) else f".{part}" for part in first["loc"]]
+    where = "".join(parts).lstrip(".")
     key = str(first["loc"][-1]) if first["loc"] else ""
     if first["type"] == "extra_forbidden":
-        return f"{where} is not known here{_nearest(key, first['loc'])}; correct or remove it{more}"
+        model = _MODELS.get(str(first["loc"][0]), StudyTable)
+        near = difflib.get_close_matches(key, model.model_fields, 1)
+        hint = f", did you mean {near[0]}" if near else ""
+        return f"{where} is not known here{hint}; correct or remove it{more}"
     if first["type"] == "value_error":
         return first["msg"].removeprefix("Value error, ") + more
     pattern = _PATTERNS.get(key) if first["type"] == "string_pattern_mismatch" else None
     expected = re.sub("(Input|String) should", "should", first["msg"])
-    got = ascii(first["input"])
-    got = got if len(got) <= 80 else got[:77] + "..."
+    text = ascii(first["input"])
+    got = text if len(text) <= 80 else text[:77] + "..."
     return f"{where} {pattern or expected}, got {got}; correct it{more}"
-
-
-def _nearest(key: str, where: Sequence[Any]) -> str:
-    models: dict[str, type[SettingsTable]] = {
-        "animals": StudyAnimal,
-        "arenas": StudyArena,
-        "sessions": StudySession,
-    }
-    model = models.get(str(where[0]), StudyTable) if len(where) > 1 else StudyTable
-    near = difflib.get_close_matches(key, model.model_fields, 1)
-    return f", did you mean {near[0]}" if near else ""
