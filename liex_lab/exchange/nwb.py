@@ -28,7 +28,7 @@ from liex_lab.errors import SessionError
 from liex_lab.exchange.pose_files import hdf5_file
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit
-from liex_lab.sessions.session import PULSE, Poses
+from liex_lab.sessions.session import PULSE, PoseArrays
 from liex_lab.tables.rows import stop_times
 
 _HUMAN = "human"
@@ -97,7 +97,7 @@ def _intervals(name: str, description: str, spans: NDArray[Any], **more: list[st
     return table
 
 
-def observed_spans(poses: Poses) -> NDArray[np.float64]:
+def observed_spans(poses: PoseArrays) -> NDArray[np.float64]:
     """Spans of time in which every frame has a pose and none is missing.
 
     Returns:
@@ -219,7 +219,7 @@ def _subject(session: Session) -> Any:
 
 
 def _add_poses(
-    made: pynwb.NWBFile, module: Any, session: Session, poses: Poses, version: str
+    made: pynwb.NWBFile, module: Any, session: Session, poses: PoseArrays, version: str
 ) -> Any:
     """Add skeleton and one series per joint with shared times; returns the PoseEstimation."""
     skeleton = ndx_pose.Skeleton(
@@ -272,7 +272,7 @@ def _add_poses(
     return estimate
 
 
-def _add_rotations(module: Any, session: Session, poses: Poses) -> None:
+def _add_rotations(module: Any, session: Session, poses: PoseArrays) -> None:
     """The root's rigid transform and each joint's rotation relative to its parent."""
     table = session.table("rotations", ["joint", "wx_rad", "wy_rad", "wz_rad"])
     names = [str(name) for name in table["joint"].iloc[: len(poses.joints) + 1]]

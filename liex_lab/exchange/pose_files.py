@@ -19,7 +19,7 @@ import pandas as pd
 
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
-from liex_lab.sessions.session import Array, Poses
+from liex_lab.sessions.session import Array, PoseArrays
 
 if TYPE_CHECKING:
     import h5py
@@ -61,7 +61,7 @@ def write_dlc(session: Session, path: Path) -> None:
     write_csv(session.bouts, path / "bouts.csv")
 
 
-def dlc_table(poses: Poses, values: Array, coords: str | tuple[str, ...]) -> pd.DataFrame:
+def dlc_table(poses: PoseArrays, values: Array, coords: str | tuple[str, ...]) -> pd.DataFrame:
     """Data frame with DeepLabCut's columns: scorer, bodyparts, coords.
 
     Args:

@@ -353,7 +353,7 @@ class Session:
 
         The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame),
         keypoints and individuals; the variables position, confidence, score, sd_mm and action;
-        pulse_index is a coordinate along time. See `Poses.likelihood` on the confidence.
+        pulse_index is a coordinate along time. See `PoseArrays.likelihood` on the confidence.
 
         Raises:
             MissingPackageError: xarray is not installed.
@@ -403,12 +403,12 @@ class Session:
             },
         )
 
-    def pose_arrays(self) -> Poses:
+    def pose_arrays(self) -> PoseArrays:
         """The poses as arrays by frame and joint, NaN where there is no pose.
 
         `session.pose_arrays().xyz_mm[10]` are the joints (J, 3) of row 10 of the recording, mm.
         """
-        return Poses.of(self.metadata, self.table("poses"), self.table("frames"))
+        return PoseArrays.of(self.metadata, self.table("poses"), self.table("frames"))
 
 
 def video_path(folder: Path, name: str, what: str = "") -> Path:
@@ -454,7 +454,7 @@ _UNSURE = 0.5  # the highest likelihood in other frames
 
 
 @dataclass(frozen=True, repr=False)
-class Poses:
+class PoseArrays:
     """Poses of one animal, one row for every recorded frame; NaN where there is no pose.
 
     Attributes:
@@ -501,7 +501,7 @@ class Poses:
         return np.where(sure, _KEPT + (1.0 - _KEPT) * self.score, _UNSURE * self.score)
 
     @staticmethod
-    def of(about: Mapping[str, Any], table: pd.DataFrame, frames: pd.DataFrame) -> Poses:
+    def of(about: Mapping[str, Any], table: pd.DataFrame, frames: pd.DataFrame) -> PoseArrays:
         """The poses of a session, see `Session.pose_arrays`.
 
         Args:
@@ -518,7 +518,7 @@ class Poses:
             columns = [table[name].to_numpy(float).reshape(shape) for name in names]
             return np.stack(columns, axis=-1) if len(names) > 1 else columns[0]
 
-        return Poses(
+        return PoseArrays(
             about["individual"],
             joints,
             tuple((int(a), int(b)) for a, b in about["animal"]["bones"]),

@@ -24,7 +24,7 @@ from liex_lab import cli
 from liex_lab.errors import MissingPackageError, SessionError
 from liex_lab.exchange import TARGETS, export
 from liex_lab.sessions import Session
-from liex_lab.sessions.session import Poses
+from liex_lab.sessions.session import PoseArrays
 from liex_lab.tables.rows import Rows
 from liex_lab.tables.schema import POSES, to_pandas
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -158,7 +158,7 @@ def test_the_usual_cut_at_a_likelihood_keeps_what_is_trusted_and_nothing_else(tm
     table = Rows(track, np.arange(120), "s", "m")
     about = {"individual": "m", "animal": {"joints": track.skeleton.names, "bones": []}}
     joints = pd.concat([to_pandas(POSES, block) for block in table.poses()])
-    poses = Poses.of(about, joints, table.frames_table)
+    poses = PoseArrays.of(about, joints, table.frames_table)
     trusted = np.isin(flags, ["", "corrected"]) & ~bridged
     np.testing.assert_array_equal(poses.likelihood >= 0.6, np.repeat(trusted[:, None], 5, axis=1))
     np.testing.assert_array_equal(  # in a file of single precision, too

@@ -18,7 +18,7 @@ from tests.sessions.walking_mouse import WalkingMouse, steady, write
 MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))
 
 
-@pytest.mark.parametrize("size", [1, 7, 50])
+@pytest.mark.parametrize("size", [7, 50])
 def test_a_table_made_in_blocks_is_the_one_made_at_once(
     size: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shutil
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -227,19 +229,19 @@ def test_the_windows_of_an_arena_are_its_region_and_the_whole_picture() -> None:
     ]
 
 
-def shown_at(folder: Path, row: int) -> dict[int, tuple[int, int]]:
-    """Sizes of the cut-outs that a viewer shows in a frame, the last that each entity was given."""
-    found: dict[int, tuple[int, int]] = {}
+def shown_at(folder: Path, rows: Sequence[int]) -> list[dict[int, tuple[int, int]]]:
+    """Sizes of the cut-outs that a viewer shows in frames, the last that each entity was given."""
+    found: list[dict[int, tuple[int, int]]] = [{} for _ in rows]
     replay = cast("Session", SimpleNamespace(path=folder))
-    for k in range(N_BOXES):
-        for which in range(N_WINDOWS):
-            columns = columns_of(replay, depth_of.cutout_entity(k, which))
-            blobs = columns.get("EncodedDepthImage:blob", [])
-            before = [at for at, frame in enumerate(columns.get("frame", [])) if frame <= row]
-            blob = blobs[before[-1]] if before else None
+    for k, which in product(range(N_BOXES), range(N_WINDOWS)):
+        columns = columns_of(replay, depth_of.cutout_entity(k, which))
+        frames = np.array(columns.get("frame", []))
+        for sizes, row in zip(found, rows, strict=True):
+            before = np.flatnonzero(frames <= row)
+            blob = columns["EncodedDepthImage:blob"][before[-1]] if len(before) else None
             if blob:
-                assert k not in found, "one cut-out is shown in one window"
-                found[k] = struct.unpack_from("<II", np.asarray(blob[0], np.uint8).tobytes(), 12)
+                assert k not in sizes, "one cut-out is shown in one window"
+                sizes[k] = struct.unpack_from("<II", np.asarray(blob[0], np.uint8).tobytes(), 12)
     return found
 
 
@@ -268,11 +270,10 @@ def test_of_every_cut_out_one_window_is_shown_at_a_time_also_where_a_run_went_on
         replay.flushed()
         replay.abandon()
         append_rrd(path, tmp_path / "session.rrd")
-    for row in (0, 1, 40, 60, 63, 64, 79, 80, 81, 149):
+    rows = (0, 1, 40, 60, 63, 64, 79, 80, 81, 149)
+    for row, found in zip(rows, shown_at(tmp_path, rows), strict=True):
         there = [(k, box) for k, box in enumerate(boxes[row].tolist()) if box[2]]
-        assert shown_at(tmp_path, row) == {
-            k: sizes[window_around(box, sizes)[0]] for k, box in there
-        }
+        assert found == {k: sizes[window_around(box, sizes)[0]] for k, box in there}
 
 
 def test_a_session_with_cut_outs_is_a_fraction_of_one_with_whole_images(

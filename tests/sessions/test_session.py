@@ -335,7 +335,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path):
 
 
 def test_memory_of_some_more_frames_is_that_of_some(tmp_path):
-    mouse = WalkingMouse(steady(8.0), camera=Camera(287.0, 287.0, 159.5, 119.5, 320, 240))
+    mouse = WalkingMouse(steady(5.0), camera=Camera(287.0, 287.0, 159.5, 119.5, 320, 240))
     depth = mouse.frame(0).depth
 
     def peak_of(n: int) -> int:
@@ -356,7 +356,7 @@ def test_memory_of_some_more_frames_is_that_of_some(tmp_path):
         return peak
 
     peak_of(16)
-    assert peak_of(192) - peak_of(96) < 0.5 * 96 * depth.nbytes
+    assert peak_of(144) - peak_of(80) < 0.5 * 64 * depth.nbytes
 
 
 def test_the_recipe_for_neural_data_finds_the_true_pulse_of_every_frame(tmp_path, monkeypatch):
