@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from nwbinspector import Importance, inspect_nwbfile, load_config
 from pynwb import NWBHDF5IO, validate
 
 from liex_lab.errors import SessionError
@@ -143,6 +142,8 @@ def test_all_that_is_known_of_the_animal_stands_in_the_file(nwb):
 
 def refused_by(path: Path) -> set[str]:
     """Checks for which DANDI's validator would refuse a file."""
+    from nwbinspector import Importance, inspect_nwbfile, load_config
+
     found: list[Any] = list(inspect_nwbfile(nwbfile_path=path, config=load_config("dandi")))
     light = Importance.BEST_PRACTICE_SUGGESTION.value
     return {one.check_function_name for one in found if one.importance.value > light}
