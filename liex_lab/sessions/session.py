@@ -16,8 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
@@ -325,7 +323,8 @@ class Session:
         Args:
             name: the table's name, such as 'poses'.
             columns: only these columns; None for all.
-            frame_index: only the rows of these frames, by number; None for all rows.
+            frame_index: only the rows of these frames, by number, with at most one row group of the
+                file in memory at a time. None for all rows.
 
         Raises:
             SessionError: there is no such table, or it is damaged.
@@ -335,10 +334,11 @@ class Session:
             known = ", ".join(sorted(p.stem for p in self.path.glob("*.parquet")))
             raise SessionError(f"the session {self.path} has no table '{name}'; it holds {known}")
         with reading_from(path):
-            chosen = None
-            if frame_index is not None:
-                chosen = pc.field("frame_index").isin(pa.array(frame_index, pa.int64()))
-            found = pd.read_parquet(path, columns=columns, filters=chosen)
+            found = (
+                pd.read_parquet(path, columns=columns)
+                if frame_index is None
+                else _rows_of(path, columns, frame_index)
+            )
             check_rows(name, found, self.metadata["animal"]["joints"])
             if name == "frames" and columns is None and PULSE.name not in found:  # before schema 8
                 before = pd.read_parquet(path, columns=["frame_index", "gap_before"])
@@ -409,6 +409,19 @@ class Session:
         `session.pose_arrays().xyz_mm[10]` are the joints (J, 3) of row 10 of the recording, mm.
         """
         return PoseArrays.of(self.metadata, self.table("poses"), self.table("frames"))
+
+
+def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> pd.DataFrame:
+    """The rows of some frames of a long table, with at most one row group in memory."""
+    wanted = columns and [*dict.fromkeys([*columns, "frame_index"])]
+    found = []
+    with pq.ParquetFile(path, pre_buffer=False) as file:
+        for k in range(file.num_row_groups):
+            group = file.read_row_group(k, wanted, use_threads=False).to_pandas()
+            found.append(group[group["frame_index"].isin(frame_index)])
+    memory.rest()
+    rows = pd.concat(found, ignore_index=True)
+    return rows if columns is None else rows[columns]
 
 
 def video_path(folder: Path, name: str, what: str = "") -> Path:
