@@ -518,10 +518,9 @@ class Thumbnails:
         half_px = int(np.ceil(max(_HALF_SPINES * spine_px, 1.3 * extent, 16.0)))
         left = int(np.round(centre[0])) - half_px
         top = int(np.round(centre[1])) - half_px
-        v, u = (np.arange(first, first + 2 * half_px) for first in (top, left))
-        inside = np.ix_((v >= 0) & (v < depth.shape[0]), (u >= 0) & (u < depth.shape[1]))
-        square = np.zeros((2 * half_px, 2 * half_px), np.uint16)
-        square[inside] = depth[np.ix_(v[inside[0].ravel()], u[inside[1].ravel()])]
+        side = 2 * half_px
+        padded = np.pad(depth, side)
+        square = padded[top + side : top + 2 * side, left + side : left + 2 * side]
         return left, top, square
 
 
