@@ -519,8 +519,10 @@ class Thumbnails:
         left = int(np.round(centre[0])) - half_px
         top = int(np.round(centre[1])) - half_px
         side = 2 * half_px
-        padded = np.pad(depth, side)
-        square = padded[top + side : top + 2 * side, left + side : left + 2 * side]
+        around = 2 * side  # an animal may reach out of the image
+        row_px, column_px = top + around, left + around
+        padded = np.pad(depth, around)
+        square = padded[row_px : row_px + side, column_px : column_px + side]
         return left, top, square
 
 
