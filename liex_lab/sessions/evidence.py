@@ -165,8 +165,8 @@ def write_evidence(folder: Path, observations: Observations, subject: Subject) -
 
 
 @contextmanager
-def _opened(session: Session) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """The arrays of observations.npz by name, and the facts on their animal.
+def _opened(session: Session) -> Iterator[Any]:
+    """The arrays of observations.npz by name; `subject` is JSON on their animal.
 
     The file's size is checked against the numbers of frames and joints.
 
@@ -178,7 +178,7 @@ def _opened(session: Session) -> Iterator[tuple[Any, dict[str, Any]]]:
     with reading_from(session.path / FILE) as path:
         memory.check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            yield arrays, json.loads(arrays["subject"].tobytes())
+            yield arrays
 
 
 def read_evidence(session: Session) -> tuple[Observations, Subject]:
@@ -199,7 +199,8 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             f"{session.path} lacks the observations of single frames ({FILE}), as sessions of "
             "earlier versions do; run `liex run` on the recording again"
         )
-    with _opened(session) as (arrays, facts):
+    with _opened(session) as arrays:
+        facts = json.loads(arrays["subject"].tobytes())
         skeleton = Skeleton.from_table(facts["skeleton"], str(session.path / FILE))
         empty = Observations.empty(skeleton, np.zeros(len(session.frames), np.int64))
         columns = []
@@ -244,7 +245,7 @@ def read_centres(session: Session) -> NDArray[np.float64] | None:
     """
     if not session.has(FILE):
         return None
-    with _opened(session) as (arrays, _):
+    with _opened(session) as arrays:
         centre = arrays["centroid_mm"][:, ::2].astype(np.float64)  # h ^ 1 is the same object
         found = np.isfinite(arrays["score"]).reshape(len(centre), -1, 2).any(axis=2)
         centre[~found] = np.nan
@@ -368,7 +369,8 @@ def skeleton_of(session: Session) -> Skeleton:
         session: the session.
     """
     if session.has(FILE):
-        with _opened(session) as (_, facts):
+        with _opened(session) as arrays:
+            facts = json.loads(arrays["subject"].tobytes())
             return Skeleton.from_table(facts["skeleton"], str(session.path / FILE))
     planned = session.metadata["plan"].get("animal")
     return Skeleton.load(
