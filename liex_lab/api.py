@@ -292,7 +292,7 @@ def draw_figures(
     """
     from liex_lab.dashboards.figures import sets
     from liex_lab.errors import SessionError
-    from liex_lab.pipelines.study.listing import list_sessions
+    from liex_lab.pipelines.study.run import list_sessions
     from liex_lab.sessions import Session
 
     path = Path(place)
@@ -555,7 +555,7 @@ def serve_dashboard(
     """
     import secrets
 
-    from liex_lab.pipelines.study.listing import list_sessions
+    from liex_lab.pipelines.study.run import list_sessions
 
     try:
         from liex_lab.dashboards.app.guard import LOOPBACK

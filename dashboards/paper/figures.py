@@ -74,36 +74,30 @@ def draw_paper(results: Results, further: Mapping[str, Any], folder: Path) -> li
     Returns:
         Paths of the figures.
     """
-    written = []
+    written = [
+        draw_cumulative(results, folder / "fig08_cumulative_error.png"),
+        draw_joint_errors(results, folder / "error_per_joint.png"),
+    ]
     if any(one["sensitivity"] for one in results):
         written.append(draw_sensitivity(results, folder / "fig07_sensitivity.png"))
-    written.append(draw_cumulative(results, folder / "fig08_cumulative_error.png"))
-    written.append(draw_joint_errors(results, folder / "error_per_joint.png"))
     for one in results:
-        animal, shown = one["animal"], one["illustration"]
-        hand = animal == "hand"
+        animal, shown, examples = one["animal"], one["illustration"], one["examples"]
         written.append(draw_candidates(shown, folder / f"fig13_candidates_{animal}.png"))
         written.append(draw_convergence(shown, folder / f"fig16_convergence_{animal}.png"))
-        names = {
-            False: f"fig{'10' if hand else '09'}_poses_{animal}.png",
-            True: f"fig{'11' if hand else '09'}_poses_{animal}_side.png",
-        }
-        for side, name in names.items():
-            if one["examples"]:
-                where = "from the side" if side else "from the camera"
+        hand = animal == "hand"
+        for rows, name, where in (
+            (examples, f"fig{'10' if hand else '09'}_poses_{animal}.png", "from the camera"),
+            (examples, f"fig{'11' if hand else '09'}_poses_{animal}_side.png", "from the side"),
+            (one["failures"], f"fig17_failures_{animal}.png", "the largest errors"),
+        ):
+            if rows:
                 title = f"{animal}, {where}: truth, blue; pose of each method, red; dot: base"
-                written.append(draw_poses(title, one["examples"], folder / name, side))
-        if one["failures"]:
-            title = f"{animal}, the largest errors: truth, blue; measured, red"
-            path = folder / f"fig17_failures_{animal}.png"
-            written.append(draw_poses(title, one["failures"], path))
+                written.append(draw_poses(title, rows, folder / name, where == "from the side"))
     if further["nyu"]:
         title = "NYU test frames, 14 points: labels, blue; answer, red"
-        path = folder / "fig12_nyu_hands.png"
-        written.append(draw_poses(title, further["nyu_hands"], path))
+        written.append(draw_poses(title, further["nyu_hands"], folder / "fig12_nyu_hands.png"))
     if further["tracking"]:
-        sequence, rows = further["tracked"]
-        written.append(draw_tracking(sequence, rows, folder / "fig18_tracking.png"))
+        written.append(draw_tracking(*further["tracked"], folder / "fig18_tracking.png"))
     if further["actions"]:
         written.append(draw_key_frames(further["key_frames"], folder / "fig19_key_frames.png"))
         written.append(draw_confusions(further["actions"], folder / "fig20_confusions.png"))
@@ -129,9 +123,8 @@ def _bones(
     panel: Axes, points: Array, edges: Edges, colour: str, width: float, dot: int | None = 0
 ) -> None:
     """A skeleton of points (J, 2), with a dot on one joint."""
-    for a, b in edges:
-        ends = points[[a, b]]
-        panel.plot(*ends.T, "-", color=colour, lw=width, solid_capstyle="round")
+    ends = np.moveaxis(points[np.array(edges).T], -1, 0)
+    panel.plot(*ends, "-", color=colour, lw=width, solid_capstyle="round")
     if dot is not None:
         panel.plot(*points[dot], "o", color=colour, ms=2.5 * width)
 
@@ -152,8 +145,9 @@ def draw_sensitivity(results: Results, path: Path) -> Path:
     """Fig. 7: the error over each of the five parameters; a red dot marks the value in use."""
     curves = [curve for one in results for curve in one["sensitivity"].values()]
     numbers = list(dict.fromkeys(number for curve in curves for number in curve["curves"]))
-    figure, grid = _sheet(max(len(numbers), 1), len(results), 3.8, 2.4)
+    figure, grid = _sheet(len(numbers), len(results), 3.8, 2.4)
     for column, one in enumerate(results):
+        grid[0][column].set_title(one["animal"])
         for line, number in zip(grid, numbers, strict=True):
             panel = line[column]
             for variant, curve in one["sensitivity"].items():
@@ -166,53 +160,59 @@ def draw_sensitivity(results: Results, path: Path) -> Path:
                 panel.plot([*points], [*points.values()], ".-", color=colour, label=name)
                 chosen = curve["chosen"][number]
                 panel.plot(chosen, points.get(chosen, np.nan), "o", color=_POSE, ms=6)
-            panel.set(xlabel=number, ylabel="mm")
             panel.locator_params(axis="x", integer=True)
             panel.margins(y=0.1)
-            panel.set_ylim(bottom=0)
+            panel.set(xlabel=number, ylabel="mm", ylim=(0, None))
             panel.grid(alpha=0.3)
-        grid[0][column].set_title(one["animal"])
     grid[0][0].legend(fontsize=7)
     return _save(figure, path)
 
 
-def draw_cumulative(results: Results, path: Path) -> Path:
-    """Fig. 8: share of frames with at most so many mm mean joint error; lost frames never count."""
-    figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), 4.2, 3.2)
+def _by_split(
+    results: Results, width: float
+) -> tuple[Figure, list[tuple[Axes, Mapping[str, Any], dict[tuple[str, str, str], Any]]]]:
+    """A sheet with a panel for each animal and split, its animal's results, and, by method, the
+    numbers on this split.
+    """
+    figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), width, 3.2)
+    panels = []
     for line, one in zip(grid, results, strict=True):
         for panel, split in zip(line, one["splits"], strict=False):
-            farthest = 0.0
-            for variant, row in one["rows"].items():
-                error = np.array(row["splits"][split]["error_quantiles_mm"])
-                if len(error):
-                    found = 100 * (1 - row["splits"][split]["lost_rate"])
-                    name, colour, style = METHODS[variant]
-                    share = np.linspace(0, found, len(error))
-                    panel.plot(error, share, style, color=colour, label=name, lw=1.6)
-                    farthest = max(farthest, float(error[round(0.85 * (len(error) - 1))]))
-            panel.set(title=f"{one['animal']}, {split}", xlim=(0, farthest), ylim=(0, 100))
-            panel.set(xlabel="mean joint error within, mm", ylabel="frames, %")
+            panel.set_title(f"{one['animal']}, {split}")
             panel.grid(alpha=0.3)
-    grid[0][0].legend(fontsize=7, loc="lower right")
+            rows = {METHODS[name]: row["splits"][split] for name, row in one["rows"].items()}
+            panels.append((panel, one, rows))
+    return figure, panels
+
+
+def draw_cumulative(results: Results, path: Path) -> Path:
+    """Fig. 8: share of frames with at most so many mm mean joint error; lost frames never count."""
+    figure, panels = _by_split(results, 4.2)
+    for panel, _, rows in panels:
+        farthest = 0.0
+        for (name, colour, style), numbers in rows.items():
+            error = np.array(numbers["error_quantiles_mm"])
+            if len(error):
+                share = np.linspace(0, 100 * (1 - numbers["lost_rate"]), len(error))
+                panel.plot(error, share, style, color=colour, label=name, lw=1.6)
+                farthest = max(farthest, float(error[round(0.85 * (len(error) - 1))]))
+        panel.set(xlim=(0, farthest), ylim=(0, 100), ylabel="frames, %")
+        panel.set_xlabel("mean joint error within, mm")
+    panels[0][0].legend(fontsize=7, loc="lower right")
     return _save(figure, path)
 
 
 def draw_joint_errors(results: Results, path: Path) -> Path:
     """Mean error of each joint, by method."""
-    figure, grid = _sheet(len(results), max(len(one["splits"]) for one in results), 4.6, 3.2)
-    for line, one in zip(grid, results, strict=True):
-        joints = one["joints"]
-        for panel, split in zip(line, one["splits"], strict=False):
-            for variant, row in one["rows"].items():
-                name, colour, style = METHODS[variant]
-                if error := row["splits"][split]["joint_mm"]:
-                    panel.plot(error, style, marker=".", color=colour, label=name)
-            panel.set(title=f"{one['animal']}, {split}", ylabel="mean error, mm")
-            turn = 60 if len(joints) > 6 else 0
-            panel.set_xticks(range(len(joints)), joints, rotation=turn, fontsize=7)
-            panel.set_ylim(bottom=0)
-            panel.grid(alpha=0.3)
-    grid[0][0].legend(fontsize=7)
+    figure, panels = _by_split(results, 4.6)
+    for panel, one, rows in panels:
+        for (name, colour, style), numbers in rows.items():
+            if numbers["joint_mm"]:
+                panel.plot(numbers["joint_mm"], style, marker=".", color=colour, label=name)
+        turn = 60 if len(one["joints"]) > 6 else 0
+        panel.set_xticks(range(len(one["joints"])), one["joints"], rotation=turn, fontsize=7)
+        panel.set(ylabel="mean error, mm", ylim=(0, None))
+    panels[0][0].legend(fontsize=7)
     return _save(figure, path)
 
 
@@ -232,8 +232,7 @@ def draw_poses(
         path: the PNG to write.
         side: view along the image's rows instead of along the optical axis.
     """
-    n = max(1, *map(len, rows.values()))
-    figure, grid = _sheet(len(rows), n, 1.65, 2.1, (1.3, 0.6))
+    figure, grid = _sheet(len(rows), max(1, *map(len, rows.values())), 1.65, 2.1, (1.3, 0.6))
     for line, (name, frames) in zip(grid, rows.items(), strict=True):
         label = METHODS[name][0].replace(", ", ",\n") if name in METHODS else name
         line[0].set_ylabel(_NYU_METHODS.get(name, label), fontsize=8)
@@ -249,43 +248,43 @@ def _pose(panel: Axes, one: Mapping[str, Any], side: bool) -> None:
     """One frame with its truth and a pose."""
     truth: Array = one["truth"]
     camera: Any = one.get("camera")
-    plane = [0, 2] if side else [0, 1]
     low, high = truth.min(axis=0), truth.max(axis=0)
     panel.set(xticks=[], yticks=[])
-    if camera is None or side:
-        panel.set_aspect("equal")
+    if camera is not None and not side:
+        middle, reach = float(truth[:, 2].mean()), 0.55 * one["spine_mm"]
+        _depth(panel, one["depth"], middle - 1.6 * reach, middle + reach, "gray")
+        panel.set_facecolor("#dfe3e6")
+        flat = camera.project
+    else:
+        plane = [0, 2] if side else [0, 1]
         half = (0.75 if side else 0.65) * max(float((high - low)[: 3 if side else 2].max()), 1.0)
+        panel.set_aspect("equal")
         _around(panel, 0.5 * (low + high)[plane], half)
+
+        def flat(points: Array) -> Array:
+            return points[:, plane]
+
     if side:
         v, u = np.nonzero(one["depth"] > 0)
         points = camera.unproject(np.stack([u, v], -1), one["depth"][v, u].astype(float))
         near = (abs(points - 0.5 * (low + high)) < half).all(axis=1)
-        panel.plot(*points[near][:, plane].T, ".", color="#8a8f94", ms=1.6, alpha=0.7)
-    elif camera is not None:
-        middle, reach = float(truth[:, 2].mean()), 0.55 * one["spine_mm"]
-        _depth(panel, one["depth"], middle - 1.6 * reach, middle + reach, "gray")
-        panel.set_facecolor("#dfe3e6")
-
-    def flat(points: Array) -> Array:
-        return points[:, plane] if side or camera is None else camera.project(points)
-
-    edges = one.get("edges", _NYU_EDGES)
+        panel.plot(*flat(points[near]).T, ".", color="#8a8f94", ms=1.6, alpha=0.7)
+    edges, pose = one.get("edges", _NYU_EDGES), one.get("pose")
     _bones(panel, flat(truth), edges, _TRUE, 1.4)
-    pose = one.get("pose")
-    said = "nothing found" if "pose" in one else "not kept"
+    result = "nothing found" if "pose" in one else "not kept"
     if pose is not None:
         _bones(panel, flat(pose), edges, _POSE, 1.4)
-        said = f"{np.linalg.norm(pose - truth, axis=-1).mean():.1f} mm"
+        result = f"{np.linalg.norm(pose - truth, axis=-1).mean():.1f} mm"
     if camera is not None and not side:
-        _, _ = panel.set_xlim(-0.5, camera.width - 0.5), panel.set_ylim(camera.height - 0.5, -0.5)
-    panel.set_title(f"{one['head']}\n{said}", fontsize=8)
+        panel.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
+    panel.set_title(f"{one['head']}\n{result}", fontsize=8)
 
 
 def _height_map(panel: Axes, shown: Mapping[str, Any], joints_px: Array) -> None:
     """The illustrated animal with its truth and a candidate."""
     heights = shown["heights"]
     rows, columns = np.nonzero(heights > 0)
-    tallest = heights[heights > 0]
+    tallest = heights[rows, columns]
     _depth(panel, heights, tallest.min() - 0.5 * np.ptp(tallest), tallest.max(), "gray")
     middle = 0.5 * (columns.min() + columns.max()), 0.5 * (rows.min() + rows.max())
     _around(panel, middle, 0.75 * max(np.ptp(rows), np.ptp(columns)))
@@ -300,10 +299,10 @@ def draw_candidates(shown: Mapping[str, Any], path: Path) -> Path:
     columns = min(n, 10 if n > 10 else 5)
     figure, grid = _sheet(-(-n // columns), columns, 1.7, 2.25)
     true_rank = np.argsort(np.argsort(ranked["error_mm"], kind="stable")) + 1
-    for k, panel in enumerate(panel for line in grid for panel in line):
-        if k >= n:
-            panel.set_axis_off()
-            continue
+    panels = [panel for line in grid for panel in line]
+    for panel in panels[n:]:
+        panel.set_axis_off()
+    for k, panel in enumerate(panels[:n]):
         _height_map(panel, shown, ranked["joints_px"][k])
         above = f"{k + 1}: {ranked['score_mm'][k]:.2f} mm"
         panel.set_title(above, color="#117733", fontsize=8)
@@ -331,23 +330,17 @@ def draw_convergence(shown: Mapping[str, Any], path: Path) -> Path:
         panel.set_title(steps["names"][step], fontsize=8)
         panel.set_xlabel(f"{steps['example_mm'][step]:.1f} mm", fontsize=8)
     panel = figure.add_subplot(grid[1, :])
-    blue = METHODS["paper"][1]
-    half: dict[str, Any] = {
-        "label": "middle half of all candidates",
-        "color": blue,
-        "alpha": 0.2,
-        "lw": 0,
-    }
-    panel.fill_between(range(n), steps["low_mm"], steps["high_mm"], **half)
+    blue, purple = METHODS["paper"][1], METHODS["default"][1]
+    half: dict[str, Any] = {"label": "middle half of all candidates", "alpha": 0.2, "lw": 0}
+    panel.fill_between(range(n), steps["low_mm"], steps["high_mm"], color=blue, **half)
     panel.plot(steps["median_mm"], color=blue, label="median of all candidates")
-    first = "the candidate ranked first, mean"
-    panel.plot(steps["best_mm"], color=METHODS["default"][1], label=first)
+    panel.plot(steps["best_mm"], color=purple, label="the candidate ranked first, mean")
     ticks = range(0, n, -(-n // 40))
-    names = [steps["names"][k] for k in ticks]
-    panel.set_xticks(ticks, names, rotation=60, fontsize=7, ha="right")
+    panel.set_xticks(ticks, [steps["names"][k] for k in ticks], rotation=60, fontsize=7, ha="right")
     panel.set(ylabel="mean joint error, mm", ylim=(0, None))
-    title = f"{shown['animal']}: after every joint and round, {shown['n_images']} images"
-    panel.set_title(title, fontsize=8)
+    panel.set_title(
+        f"{shown['animal']}: after every joint and round, {shown['n_images']} images", fontsize=8
+    )
     panel.legend(fontsize=7)
     panel.grid(alpha=0.3)
     return _save(figure, path)
@@ -358,7 +351,7 @@ def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Pa
 
     Args:
         sequence: the sequence with its truth.
-        rows: `single` (frames by themselves) and, if available, `algorithm3` and `smoothed`.
+        rows: `single` (frames by themselves), `algorithm3` and `smoothed`.
         path: the PNG to write; its folder is created.
     """
     figure = Figure(figsize=(13.0, 6.4), layout="constrained")
@@ -372,12 +365,10 @@ def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Pa
             panel.axvspan(start, stop, color="#000000", alpha=0.05, lw=0)
             panel.text(start, 0.98, event.kind, fontsize=7, va="top", transform=top)
     for name, (label, colour, width) in _TRACKERS.items():
-        if name in rows:
-            error = rows[name].error_mm
-            mean = float(np.nanmean(error))
-            label = f"{label}: mean {mean:.2f} mm"
-            panel.plot(seconds, error, color=colour, lw=width, label=label)
-            panel.axhline(mean, color=colour, lw=width, ls="--")
+        mean = float(np.nanmean(rows[name].error_mm))
+        label = f"{label}: mean {mean:.2f} mm"
+        panel.plot(seconds, rows[name].error_mm, color=colour, lw=width, label=label)
+        panel.axhline(mean, color=colour, lw=width, ls="--")
     panel.set(xlabel="time, s", ylabel="mean joint error, mm", yscale="log")
     panel.margins(x=0.0)
     panel.legend(loc="upper right", fontsize=8)
@@ -398,22 +389,18 @@ def worst_moments(error: Array) -> list[int]:
 
 def _moment(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed], frame: int) -> None:
     """The depth around the animal with the true and the estimated skeletons."""
-    spine = sequence.spine_mm
-    T_camera_arena = sequence.T_arena_camera.inverse()
+    spine, camera = sequence.spine_mm, sequence.camera
     middle = sequence.joints_camera[frame].mean(axis=0)
     depth = sequence.depths(frame, frame + 1)[0]
     _depth(panel, depth, middle[2] - 0.6 * spine, middle[2] + 0.6 * spine, "Greys")
-    reach = 0.9 * spine * sequence.camera.fx / middle[2]
-    _around(panel, sequence.camera.project(middle), reach)
-    shown = {"": (sequence.joints_arena[frame], _GREEN)}
-    for name in ("single", "smoothed"):
-        if name in rows:
-            shown[name] = (rows[name].joints[frame], _TRACKERS[name][1])
-    for joints, colour in shown.values():
-        points = sequence.camera.project(T_camera_arena @ joints)
+    _around(panel, camera.project(middle), 0.9 * spine * camera.fx / middle[2])
+    skeletons = {_GREEN: sequence.joints_arena} | {
+        _TRACKERS[name][1]: rows[name].joints for name in ("single", "smoothed")
+    }
+    for colour, joints in skeletons.items():
+        points = camera.project(sequence.T_arena_camera.inverse() @ joints[frame])
         _bones(panel, points, sequence.skeleton.edges, colour, 2.0, -1)
-    alone = rows["single"].error_mm[frame]
-    tracked = rows["smoothed"].error_mm[frame] if "smoothed" in rows else np.nan
+    alone, tracked = (rows[name].error_mm[frame] for name in ("single", "smoothed"))
     panel.set_title(f"frame {frame}: {alone:.0f} mm, smoothed {tracked:.0f} mm", fontsize=8)
 
 
@@ -430,14 +417,13 @@ def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
     for panel in panels[len(acts) :]:
         panel.set_axis_off()
     for panel, act in zip(panels, acts, strict=False):
-        for body in act["bodies_mm"]:
-            panel.plot(*body.T, ".", color="#b9bfc5", ms=1.6, alpha=0.6)
-        for joints in act["skeletons_mm"]:
+        along, bodies, skeletons = act["path_mm"], act["bodies_mm"], act["skeletons_mm"]
+        panel.plot(*np.concatenate(bodies).T, ".", color="#b9bfc5", ms=1.6, alpha=0.6)
+        for joints in skeletons:
             _bones(panel, joints, act["edges"], "#3a4046", 0.9, None)
-        along = act["path_mm"]
         order = np.linspace(0, 1, len(along))
-        panel.scatter(along[:, 0], along[:, 1], c=order, cmap="coolwarm", s=9, zorder=3)
-        everything = np.concatenate([along, *act["bodies_mm"], *act["skeletons_mm"]])
+        panel.scatter(*along.T, c=order, cmap="coolwarm", s=9, zorder=3)
+        everything = np.concatenate([along, *bodies, *skeletons])
         low, high = everything.min(axis=0), everything.max(axis=0)
         half = 0.5 * float((high - low).max()) + 8.0  # square, in any direction
         x, y = 0.5 * (low + high) - half
@@ -447,8 +433,11 @@ def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
         where = "from the side" if act["side"] else "from above"
         name = act["word"].replace("_", " ")
         panel.set_title(f"{name}, {1000 * act['seconds']:.0f} ms, {where}", fontsize=9)
-    title = "Key frames of the fish's actions, and the path of the middle of its body"
-    figure.suptitle(f"{title} from blue to red; bar: 20 mm", fontsize=9)
+    figure.suptitle(
+        "Key frames of the fish's actions, and the path of the middle of its body from blue to "
+        "red; bar: 20 mm",
+        fontsize=9,
+    )
     return _save(figure, path)
 
 
@@ -462,24 +451,24 @@ def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
     words = [str(word).replace("_", " ") for word in result["confusion"]["words"]]
     side = 1.6 + 0.42 * len(words)
     figure, (panels,) = _sheet(1, len(_RECOGNISERS), side, side + 0.4)
+    turned: dict[str, Any] = {"rotation": 60, "ha": "right", "rotation_mode": "anchor"}
     for panel, ((name, key), title) in zip(panels, _RECOGNISERS.items(), strict=True):
-        first = panel is panels[0]
         low, high = (100 * bound for bound in result["accuracy_interval95"][name])
         accuracy = result[f"{key}_accuracy"]
         panel.set_title(f"{title}: {accuracy:.1%} ({low:.1f} to {high:.1f})", fontsize=9)
         counts = np.asarray(result["confusion"][name], float)
         share = 100.0 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
         panel.imshow(share, cmap="Blues", vmin=0.0, vmax=100.0)
-        style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7}
         for row, column in zip(*np.nonzero(counts), strict=True):
             value = share[row, column]
             colour = "white" if value > 55.0 else "black"
-            panel.text(column, row, f"{value:.0f}", color=colour, **style)
-        turned: dict[str, Any] = {"rotation": 60, "ha": "right", "rotation_mode": "anchor"}
+            where: dict[str, Any] = {"ha": "center", "va": "center", "color": colour}
+            panel.text(column, row, f"{value:.0f}", fontsize=7, **where)
         panel.set_xticks(range(len(words)), words, fontsize=7, **turned)
-        panel.set_yticks(range(len(words)), words if first else [""] * len(words), fontsize=7)
+        panel.set_yticks([])
         panel.set_xlabel("recognised as", fontsize=8)
-        panel.set_ylabel("true action" if first else "", fontsize=8)
+    panels[0].set_yticks(range(len(words)), words, fontsize=7)
+    panels[0].set_ylabel("true action", fontsize=8)
     return _save(figure, path)
 
 
@@ -500,7 +489,8 @@ def draw_scene(
         folder: of the PNG; it is created.
     """
     figure, panels = _sheet(2, len(_SCENE_MOMENTS), 3.75, 3.6)
-    for k, share in enumerate(_SCENE_MOMENTS):
+    camera, skeleton = recording.camera, recording.skeleton
+    for whole, near, share in zip(*panels, _SCENE_MOMENTS, strict=True):
         frame = min(int(share * len(recording)), len(recording) - 1)
         depth = recording.depths(frame, frame + 1)[0]
         read = depth[depth > 0]
@@ -509,32 +499,22 @@ def draw_scene(
         for one in individuals:
             colour = "#AA3377" if one.trusted[frame] else "#EE7733"
             shown.append((one.joints_camera[frame], colour, 1.2))
-        for panel in (panels[0][k], panels[1][k]):
+        for panel in (whole, near):
             _depth(panel, depth, low, high, "viridis_r")
             panel.set_facecolor("black")
             for joints, colour, width in shown:
-                _in_image(panel, recording, joints, colour, width)
+                if not np.isfinite(joints).all():
+                    continue
+                points = camera.project(joints)
+                if len(joints) == skeleton.n_joints:
+                    _bones(panel, points, skeleton.edges, colour, width, skeleton.tip)
+                else:  # of another animal than the recording's
+                    panel.plot(*points.T, ".", color=colour, ms=3.0)
             panel.set(xlim=(-0.5, recording.width - 0.5), ylim=(recording.height - 0.5, -0.5))
         view = ", ".join(f"{100 * truth.visible[frame]:.0f} %" for truth in truths)
-        title = f"{name}, frame {frame}, in view: {view or 'none'}"
-        panels[0][k].set_title(title, fontsize=8)
+        whole.set_title(f"{name}, frame {frame}, in view: {view or 'none'}", fontsize=8)
         if truths and np.isfinite(truths[0].joints_camera[frame]).all():
             middle, spine = truths[0].joints_camera[frame].mean(axis=0), truths[0].spine_mm
-            near = panels[1][k]
             near.images[0].set_clim(middle[2] - 0.8 * spine, middle[2] + 0.8 * spine)
-            reach = 1.6 * spine * recording.camera.fx / middle[2]
-            _around(near, recording.camera.project(middle), reach)
+            _around(near, camera.project(middle), 1.6 * spine * camera.fx / middle[2])
     return _save(figure, folder / f"{name}.png")
-
-
-def _in_image(
-    panel: Axes, recording: TrueRecording, joints: Array, colour: str, width: float
-) -> None:
-    """Draw bones if the joints are those of the recording's animal, dots otherwise."""
-    if not np.isfinite(joints).all():
-        return
-    skeleton, points = recording.skeleton, recording.camera.project(joints)
-    if len(joints) == skeleton.n_joints:
-        _bones(panel, points, skeleton.edges, colour, width, skeleton.tip)
-    else:
-        panel.plot(*points.T, ".", color=colour, ms=3.0)

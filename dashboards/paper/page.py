@@ -23,18 +23,10 @@ from liex_lab.sessions.provenance import package_version
 
 from ..units import page
 from .figures import draw_paper
-from .published import (
-    DEVIATIONS,
-    HAND,
-    OTHERS_FPS,
-    OTHERS_MM,
-    PUBLISHED_FPS,
-    PUBLISHED_MM,
-    TITLES,
-)
+from .published import DEVIATIONS, HAND, OTHERS_FPS, OTHERS_MM, PUBLISHED_FPS, PUBLISHED_MM, TITLES
 
 Results = Mapping[str, Any]  # results of one animal, by the job's names
-Table = tuple[Sequence[str], Sequence[Sequence[str]]]  # head and rows
+Table = Sequence[Mapping[str, str]]  # rows, by the heads of their columns
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SPLIT_COLUMNS = (  # of a table's row that differ by split
@@ -116,25 +108,27 @@ def write_paper(
 
 def frame(results: Sequence[Results]) -> pd.DataFrame:
     """Every row on every split of every animal, with its provenance and the published values."""
-    rows = [
-        {
-            "animal": r["animal"],
-            "method": TITLES[variant],
-            "variant": variant,
-            "origin": row["origin"],
-            "other_processor": row["other_processor"],
-            **row["made"],
-            **row["rate"],
-            "published_mean_joint_error_mm": PUBLISHED_MM.get(r["animal"], {}).get(variant),
-            "published_frames_per_s": _published_rate(r, variant),
-            "split": split,
-            **numbers,
-        }
-        for r in results
-        for variant, row in r["rows"].items()
-        for split, numbers in row["splits"].items()
-    ]
-    return pd.DataFrame(rows, dtype=object)
+    return pd.DataFrame(
+        [
+            {
+                "animal": r["animal"],
+                "method": TITLES[variant],
+                "variant": variant,
+                "origin": row["origin"],
+                "other_processor": row["other_processor"],
+                **row["made"],
+                **row["rate"],
+                "published_mean_joint_error_mm": PUBLISHED_MM.get(r["animal"], {}).get(variant),
+                "published_frames_per_s": _published_rate(r, variant),
+                "split": split,
+                **numbers,
+            }
+            for r in results
+            for variant, row in r["rows"].items()
+            for split, numbers in row["splits"].items()
+        ],
+        dtype=object,
+    )
 
 
 def _published_rate(results: Results, variant: str) -> float | None:
@@ -164,11 +158,17 @@ def _in_markdown(results: Results, quick: bool) -> dict[str, Any]:
     }
 
 
+def _cells(table: Table) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of a table."""
+    head = list(dict.fromkeys(name for row in table for name in row))
+    return head, [[row.get(name, "") for name in head] for row in table]
+
+
 def _grid(table: Table) -> Markup:
     """A table in Markdown."""
-    lines = [table[0], ["---"] * len(table[0]), *table[1]]
-    grid = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return Markup(grid)  # nosec B704: Markdown of our own numbers, not HTML
+    head, rows = _cells(table)
+    lines = (f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
+    return Markup("\n".join(lines))  # nosec B704: Markdown of our own numbers, not HTML
 
 
 def _number(value: float | None, digits: int = 2) -> str:
@@ -178,35 +178,43 @@ def _number(value: float | None, digits: int = 2) -> str:
 def error_table(results: Results) -> Table:
     """One animal's medians: a row per method, and one for wrong objects, common to all methods."""
     published = PUBLISHED_MM.get(results["animal"], {})
-    splits = results["splits"]
+    heads = {split: f"{split}: median (95\u00a0%)" for split in results["splits"]}
+    theirs = "published, other data: mean"
     rows = []
     for variant, title in TITLES.items():
         row = results["rows"].get(variant)
-        cells = [_median(row["splits"][split]) if row else "" for split in splits]
-        rows.append([title, *cells, _number(published.get(variant)), _origin(row)])
+        medians = {heads[s]: _median(row["splits"][s]) if row else "" for s in heads}
+        mean = _number(published.get(variant))
+        rows.append({"method": title, **medians, theirs: mean, "row": _origin(row)})
     if results["animal"] == "hand":
-        for title, value in OTHERS_MM.items():
-            rows.append([title, *[""] * len(splits), _number(value), "published"])
-    if results["rows"]:
-        given = next(iter(results["rows"].values()))["splits"]  # every row is given the same
-        rows.append(
-            ["another object measured (alone)", *(_wrong(given[s]) for s in splits), "", ""]
-        )
-    head = ["method", *(f"{split}: median (95\u00a0%)" for split in splits)]
-    return [*head, "published, other data: mean", "row"], rows
+        rows += [
+            {"method": title, theirs: _number(value), "row": "published"}
+            for title, value in OTHERS_MM.items()
+        ]
+    for row in [*results["rows"].values()][:1]:  # every row is given the same objects
+        wrong = {
+            head: f"{100 * one['wrong_object']:.2f} % ({100 * one['wrong_object_alone']:.2f} %)"
+            for split, head in heads.items()
+            for one in (row["splits"][split],)
+        }
+        rows.append({"method": "another object measured (alone)", **wrong})
+    return rows
 
 
 def mean_table(results: Results) -> Table:
     """One animal's means, flips and lost frames, by method and split."""
     rows = []
     for variant, row in results["rows"].items():
-        numbers = [row["splits"][split] for split in results["splits"]]
-        cells = [text for one in numbers for text in (_number(one["mean_mm"]), _flips(one))]
-        lost = "/".join(f"{100 * one['lost_rate']:.1f}" for one in numbers)
-        n_frames = "/".join(str(one["n_frames"]) for one in numbers)
-        rows.append([TITLES[variant], *cells, lost, n_frames])
-    head = [text for split in results["splits"] for text in (f"{split}: mean", "flips")]
-    return ["method", *head, "lost, %", "frames"], rows
+        cells = {"method": TITLES[variant]}
+        numbers = {split: row["splits"][split] for split in results["splits"]}
+        for split, one in numbers.items():
+            flips = one["flip_rate"]
+            cells[f"{split}: mean"] = _number(one["mean_mm"])
+            cells[f"{split}: flips"] = "" if flips is None else f"{100 * flips:.1f} %"
+        cells["lost, %"] = "/".join(f"{100 * one['lost_rate']:.1f}" for one in numbers.values())
+        cells["frames"] = "/".join(str(one["n_frames"]) for one in numbers.values())
+        rows.append(cells)
+    return rows
 
 
 def _origin(row: Mapping[str, Any] | None) -> str:
@@ -222,55 +230,46 @@ def _median(numbers: Mapping[str, Any]) -> str:
     return _number(numbers["median_mm"]) + interval
 
 
-def _wrong(numbers: Mapping[str, Any]) -> str:
-    return f"{100 * numbers['wrong_object']:.2f} % ({100 * numbers['wrong_object_alone']:.2f} %)"
-
-
-def _flips(numbers: Mapping[str, Any]) -> str:
-    return "" if numbers["flip_rate"] is None else f"{100 * numbers['flip_rate']:.1f} %"
-
-
 def rate_table(results: Sequence[Results]) -> Table:
     """Frames per second of each method."""
-    rows = [
-        [
-            r["animal"],
-            TITLES[variant],
-            _number(row["rate"]["frames_per_s"], 0),
-            _number(row["rate"]["ratio_to_default"], 3),
-            row["rate"]["picture"],
-            str(row["rate"]["cores"]),
-            _number(_published_rate(r, variant), 0),
-            _origin(row),
-        ]
+    hand = any(r["animal"] == "hand" for r in results)
+    return [
+        {
+            "animal": r["animal"],
+            "method": TITLES[variant],
+            "frames/s": _number(row["rate"]["frames_per_s"], 0),
+            "ratio to default": _number(row["rate"]["ratio_to_default"], 3),
+            "image": row["rate"]["picture"],
+            "cores": str(row["rate"]["cores"]),
+            "published": _number(_published_rate(r, variant), 0),
+            "row": _origin(row),
+        }
         for r in results
         for variant, row in r["rows"].items()
+    ] + [
+        {"animal": "hand", "method": title, "published": f"{rate} (GPU)", "row": "published"}
+        for title, rate in OTHERS_FPS.items()
+        if hand
     ]
-    if any(r["animal"] == "hand" for r in results):
-        for title, rate in OTHERS_FPS.items():
-            rows.append(["hand", title, *[""] * 4, f"{_number(rate, 0)} (GPU)", "published"])
-    head = ["animal", "method", "frames/s", "ratio to default", "image", "cores", "published"]
-    return [*head, "row"], rows
 
 
 def origin_table(results: Sequence[Results]) -> Table:
     """Command, seed, version and amount of training of each row."""
-    rows = [
-        [
-            r["animal"],
-            TITLES[variant],
-            _origin(row),
-            str(row["made"]["training_images"] or ""),
-            f"{row['made']['seed']} ({len(row['made']['seeds'])})",
-            f"{row['made']['version']}, {row['made']['date']}",
-            ", ".join(filter(None, (row["made"]["machine"], row["made"].get("processor")))),
-            f"`{row['made']['command']}`",
-        ]
+    return [
+        {
+            "animal": r["animal"],
+            "method": TITLES[variant],
+            "row": _origin(row),
+            "training images": str(made["training_images"] or ""),
+            "seed (trainings)": f"{made['seed']} ({len(made['seeds'])})",
+            "version, date": f"{made['version']}, {made['date']}",
+            "machine": ", ".join(filter(None, (made["machine"], made.get("processor")))),
+            "command": f"`{made['command']}`",
+        }
         for r in results
         for variant, row in r["rows"].items()
+        for made in (row["made"],)
     ]
-    head = ["animal", "method", "row", "training images", "seed (trainings)", "version, date"]
-    return [*head, "machine", "command"], rows
 
 
 def notes_of(results: Results, quick: bool) -> list[str]:
@@ -278,7 +277,7 @@ def notes_of(results: Results, quick: bool) -> list[str]:
 
     A quick run makes no claim about the order of the methods.
     """
-    postures = results["test_postures"]
+    postures, published = results["test_postures"], PUBLISHED_MM.get(results["animal"], {})
     notes = [f"Test postures are {postures}."] if postures else []
     for variant, why in results["missing"].items():
         notes.append(f"{TITLES.get(variant, variant)} was not measured: {why}.")
@@ -291,8 +290,15 @@ def notes_of(results: Results, quick: bool) -> list[str]:
     for variant in results["rows"]:
         if splits := _where_ahead(results, variant, "default"):
             notes.append(f"{TITLES[variant]} is ahead of the default on {splits}.")
-    turned = list(_turned_pairs(results))
-    published = PUBLISHED_MM.get(results["animal"], {})
+    turned = []
+    for pair in combinations(published, 2):
+        ahead, behind = sorted(pair, key=published.__getitem__)
+        if splits := _where_ahead(results, behind, ahead):
+            turned.append(
+                f"In the paper, {TITLES[ahead]} (mean {published[ahead]:.2f} mm) is ahead of "
+                f"{TITLES[behind]} ({published[behind]:.2f} mm); here, on the same object and with "
+                f"the differences below, {TITLES[behind]} is ahead on {splits}."
+            )
     if not turned and published and set(published) <= set(results["rows"]):
         notes.append("No two methods rank differently from the paper with disjoint intervals.")
     return notes + turned
@@ -323,19 +329,6 @@ def _where_ahead(results: Results, a: str, b: str) -> str:
     return ", ".join(found)
 
 
-def _turned_pairs(results: Results) -> Iterator[str]:
-    """Pairs of rows whose order differs from the published one on some split."""
-    published = PUBLISHED_MM.get(results["animal"], {})
-    for pair in combinations(published, 2):
-        ahead, behind = sorted(pair, key=published.__getitem__)
-        if splits := _where_ahead(results, behind, ahead):
-            yield (
-                f"In the paper, {TITLES[ahead]} (mean {published[ahead]:.2f} mm) is ahead of "
-                f"{TITLES[behind]} ({published[behind]:.2f} mm); here, on the same object and with "
-                f"the differences below, {TITLES[behind]} is ahead on {splits}."
-            )
-
-
 def exhibits(
     results: Sequence[Results], further: Mapping[str, Any], figures: Sequence[Path], quick: bool
 ) -> dict[str, dict[str, Any]]:
@@ -357,9 +350,9 @@ def exhibits(
         notes["Table 2"].append(further["nyu"]["labels_used"])
     else:
         notes["Table 2"].append(f"NYU: {further['missing']['nyu']}.")
-    if told := further["tracking"]:
-        caption = f"{told['animal']}, {told['sequence']} sequence, {told['n_frames']} frames"
-        tables["Fig. 18"].append((caption, _tracking_table(told)))
+    if tracking := further["tracking"]:
+        caption = "{animal}, {sequence} sequence, {n_frames} frames".format_map(tracking)
+        tables["Fig. 18"].append((caption, _tracking_table(tracking)))
     if further["actions"]:
         tables["Fig. 20"].append(("", _actions_table(further["actions"])))
     found = {}
@@ -403,46 +396,53 @@ def _nyu_table(nyu: Mapping[str, Any]) -> Table:
         f"{name}, the frames of ours": {"method": f"{name}, on the frames of ours alone", **row}
         for name, row in nyu["same_frames"].items()
     }
-    rows = [
-        [
-            str(row.get("method", name)),
-            str(row["n_frames"]),
-            _number(row.get("root_given_mm_14")),
-            _number(row.get("root_estimated_mm_14")),
-        ]
+    return [
+        {
+            "method": str(row.get("method", name)),
+            "frames": str(row["n_frames"]),
+            "14 points, root given, mm": _number(row.get("root_given_mm_14")),
+            "14 points, root estimated, mm": _number(row.get("root_estimated_mm_14")),
+        }
         for name, row in {**nyu["published"], **same, "liex_lab": nyu["ours"]}.items()
     ]
-    head = ["method", "frames", "14 points, root given, mm", "14 points, root estimated, mm"]
-    return head, rows
 
 
 def _tracking_table(tracking: Mapping[str, Any]) -> Table:
     """Errors of each tracker."""
-    keys = ("mean_joint_error_mm", "p95_joint_error_mm", "ratio_to_single", "lost_rate")
-    rows = [
-        [tracking["row_names"][name], *(_number(row.get(key)) for key in keys)]
+    return [
+        {
+            "": tracking["row_names"][name],
+            "mean, mm": _number(row.get("mean_joint_error_mm")),
+            "95 %, mm": _number(row.get("p95_joint_error_mm")),
+            "ratio to single frames": _number(row.get("ratio_to_single")),
+            "lost": _number(row.get("lost_rate")),
+        }
         for name, row in tracking["rows"].items()
     ]
-    return ["", "mean, mm", "95 %, mm", "ratio to single frames", "lost"], rows
 
 
 def _actions_table(actions: Mapping[str, Any]) -> Table:
     """Accuracies of the recognisers on cut-out actions."""
-    rows = []
-    for name, key, kind, published in (
-        ("the paper's, tangent vectors", "tangent_accuracy", "tangent", "91.33 %"),
-        ("the paper's, joint positions", "joint_accuracy", "joints", "79.19 %"),
-        ("ours", "default_accuracy", "default", ""),
-    ):
-        low, high = actions["accuracy_interval95"][kind]
-        interval = f"{100 * low:.1f} to {100 * high:.1f} %"
-        rows.append([name, f"{100 * actions[key]:.1f} %", interval, published])
-    return ["recogniser", "accuracy", "95 % interval of sequences", "published, real fish"], rows
+    return [
+        {
+            "recogniser": name,
+            "accuracy": f"{100 * actions[key]:.1f} %",
+            "95 % interval of sequences": "{:.1f} to {:.1f} %".format(
+                *(100 * bound for bound in actions["accuracy_interval95"][kind])
+            ),
+            "published, real fish": published,
+        }
+        for name, key, kind, published in (
+            ("the paper's, tangent vectors", "tangent_accuracy", "tangent", "91.33 %"),
+            ("the paper's, joint positions", "joint_accuracy", "joints", "79.19 %"),
+            ("ours", "default_accuracy", "default", ""),
+        )
+    ]
 
 
 def _in_html(caption: str, table: Table) -> tuple[str, Sequence[str], list[Any], list[str]]:
     """A table for the template; text columns get the class `text`, others `number`."""
-    head, rows = table
+    head, rows = _cells(table)
     kinds = []
     for column in zip(*rows, strict=True):
         cells = [cell for cell in column if cell]

@@ -280,7 +280,7 @@ def evaluate_speed(
     variant.
     """
     if recordings:
-        from liex_lab.pipelines.evaluation.recordings import evaluate_recordings
+        from liex_lab.pipelines.evaluation.speed import evaluate_recordings
 
         return evaluate_recordings(progress=progress)
     from liex_lab.pipelines.evaluation.speed import evaluate_speed as measure

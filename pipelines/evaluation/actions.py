@@ -29,13 +29,10 @@ from numpy.typing import NDArray
 from sklearn.metrics import f1_score
 from sklearn.tree import DecisionTreeClassifier
 
-from liex_lab.actions.channels import channel_names, segments_of
-from liex_lab.actions.ethogram import runs_of
+from liex_lab.actions import channels, ethogram, storage, vocabulary
 from liex_lab.actions.labels import LabelledTrack, confusion, interval95, timeline_scores
 from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
-from liex_lab.actions.storage import bundled_action_models, load_action_model
 from liex_lab.actions.timeline import TimelineModel
-from liex_lab.actions.vocabulary import printed_meanings
 from liex_lab.behaviour.bouts import measure_bouts, recognise
 from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.errors import LiexError
@@ -44,14 +41,16 @@ from liex_lab.tables.rows import Rows, bout_rows
 
 from ..training.action_model import (
     FAST_HZ,
+    N_USUAL,
     RATE_HZ,
-    by_usual_camera,
+    AgentTrack,
+    acted,
+    acted_tracks,
     cut_sequences,
     test_recordings,
     train_actions,
     training_recordings,
 )
-from ..training.agent_tracks import AgentTrack, acted, acted_tracks
 from ..training.pose_model import cache_folder, estimator_of
 
 Array = NDArray[np.float64]
@@ -76,7 +75,7 @@ PROTOCOL = (
     "times, and the tracker nothing else; at {fast:g} frames per second the first "
     "{fast_minutes:.0f} minutes of the same ones are rendered again, frame by frame. lost_by_fps: "
     "what that is less than at the usual rate over the same time. speed_only_macro_f1: a decision "
-    "tree on speed alone, to show that the task is not told by speed. contradictions: bouts of the "
+    "tree on speed alone, to show that speed does not solve the task. contradictions: bouts of the "
     "same uncut recordings that break a measured limit of their word's printed definition, without "
     "and with the check that `liex run` makes. one_hour: the time that features and recognition of "
     "an hour's track take; core_seconds: of the machine's cores, whatever else they did."
@@ -117,7 +116,7 @@ def evaluate_actions(
         )
     estimator = estimator_of(animal, "default", progress, pose_model)
     recogniser = _recogniser(animal, model, pose_model, progress)
-    learners = by_usual_camera(training_recordings(animal))
+    learners = training_recordings(animal)[:N_USUAL]
     if animal == "fish":  # other animals' cut-out sequences come from these, too
         learners = learners[::_LEARNERS]
     learned = acted_tracks(learners, estimator, progress)
@@ -154,7 +153,7 @@ def evaluate_actions(
             minutes=_minutes(tracks),
             animals=len(tracks),
             fast=FAST_HZ,
-            fast_minutes=sum(one.seen.seconds[-1] for one in fast) / 60.0,
+            fast_minutes=sum(one.observations.seconds[-1] for one in fast) / 60.0,
         ),
     }
     if draw is not None:
@@ -207,10 +206,10 @@ def _recogniser(
     animal: str, model: str | Path | None, pose_model: str | Path | None, progress: Progress
 ) -> TimelineModel:
     """The named model, the bundled one, or one that is trained now."""
-    if model is not None or animal in bundled_action_models():
-        return load_action_model(model or animal)
+    if model is not None or animal in storage.bundled_action_models():
+        return storage.load_action_model(model or animal)
     out = cache_folder() / f"{animal}-actions"
-    return load_action_model(
+    return storage.load_action_model(
         train_actions(out, animal=animal, pose_model=pose_model, progress=progress)[0]
     )
 
@@ -219,7 +218,7 @@ def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
     """Every named bout of at least seven frames as a track of its own."""
     found = []
     for one in tracks:
-        for start, stop, word in zip(*runs_of(one.words), strict=True):
+        for start, stop, word in zip(*ethogram.runs_of(one.words), strict=True):
             if word and stop - start >= _LEAST_FRAMES:
                 found.append(one[slice(start, stop)])
     return found
@@ -255,7 +254,9 @@ def _timelines(
     alike = _scores(
         recogniser,
         [
-            one[: int(np.searchsorted(one.track.times_ns, other.seen.times_ns[-1], "right"))]
+            one[
+                : int(np.searchsorted(one.track.times_ns, other.observations.times_ns[-1], "right"))
+            ]
             for one, other in zip(tracks, fast, strict=True)
         ],
     )
@@ -287,7 +288,7 @@ def contradictions(
         `unchecked` and `checked` (as in `liex run`), each with the numbers of `bouts`, of
         `contradicting` ones, and of these `by_word`.
     """
-    meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
+    meanings = vocabulary.printed_meanings(recogniser.skeleton, recogniser.definitions)
     tables: dict[str, list[pd.DataFrame]] = {"unchecked": [], "checked": []}
     for one in tracks:
         frames = Rows(one.track, np.arange(one.track.n_frames), "", "").frames_table
@@ -387,8 +388,8 @@ def _speeds(tracks: Sequence[LabelledTrack], clock_hz: float) -> tuple[Array, ND
     words = []
     for one in tracks:
         time_s = one.track.times_ns * 1e-9
-        column = channel_names(one.track.skeleton).index("speed")
-        for segment in segments_of(one.track, clock_hz):
+        column = channels.channel_names(one.track.skeleton).index("speed")
+        for segment in channels.segments_of(one.track, clock_hz):
             row = np.searchsorted(time_s, segment.times_s - 0.5 / clock_hz).clip(0, len(time_s) - 1)
             speeds.append(segment.values[:, [column]])
             words.append(one.words[row])

@@ -61,7 +61,7 @@ _AT_ONCE = 256
 
 
 @dataclass(frozen=True)
-class Motion:
+class PointMotion:
     """Postures of one animal, and their rates of change.
 
     Attributes:
@@ -127,7 +127,7 @@ def _elevation(direction: Array) -> Array:
     return np.asarray(np.degrees(np.arctan2(direction[:, 2], level)))
 
 
-def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
+def motion_figures(real: PointMotion, virtual: dict[str, PointMotion]) -> dict[str, Any]:
     """Quantiles of postures and rates of change of a real animal and of virtual ones.
 
     Returns:
@@ -137,7 +137,7 @@ def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
             median bend and turn with their signs, 0 without a lean to one side. See
             `MOTION_PROTOCOL`.
     """
-    own = _shown(real)
+    own, posture = _shown(real), real.posture()
     others = {name: _shown(one) for name, one in virtual.items()}
     quantiles = {
         measure: {
@@ -153,7 +153,6 @@ def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
         outside[name] = {
             m: float(((own[m] < low) | (own[m] > high)).mean()) for m, (low, high) in bounds.items()
         }
-    posture = real.posture()
     return {
         "n_frames": {"real": len(real.points_mm)}
         | {name: len(one.points_mm) for name, one in virtual.items()},
@@ -168,7 +167,7 @@ def motion_figures(real: Motion, virtual: dict[str, Motion]) -> dict[str, Any]:
     }
 
 
-def _shown(motion: Motion) -> dict[str, Array]:
+def _shown(motion: PointMotion) -> dict[str, Array]:
     """Postures, angles on the floor also unsigned and about their median, and rates of change."""
     shown: dict[str, Array] = {}
     for name, values in motion.posture().items():
@@ -178,24 +177,19 @@ def _shown(motion: Motion) -> dict[str, Array]:
     return shown | motion.change()
 
 
-def nearest(real: Motion, virtual: Motion) -> Array:
+def nearest(real: PointMotion, virtual: PointMotion) -> Array:
     """Difference (n,) degrees of each real posture to the most similar virtual or mirrored one."""
-    own, drawn = (_angles(one) for one in (real, virtual))
-    mirrored = drawn * np.array([-1.0 if name in _UNSIGNED else 1.0 for name in POSTURE[:-1]])
-    drawn = np.concatenate([drawn, mirrored])
+    own, drawn = (  # the five angles (n, 5) of each posture
+        np.stack([*one.posture().values()][:-1], axis=-1) for one in (real, virtual)
+    )
+    mirror = np.array([-1.0 if name in _UNSIGNED else 1.0 for name in POSTURE[:-1]])
+    drawn = np.concatenate([drawn, drawn * mirror])
     return np.concatenate(
         [
             np.sqrt(((own[at : at + _AT_ONCE, None] - drawn) ** 2).mean(axis=-1).min(axis=1))
             for at in range(0, len(own), _AT_ONCE)
         ]
     )
-
-
-def _angles(motion: Motion) -> Array:
-    """The five angles (n, 5) of each posture."""
-    posture = motion.posture()
-    names: Sequence[str] = POSTURE[:-1]
-    return np.stack([posture[name] for name in names], axis=-1)
 
 
 NAMES = ("TTI", "Trunk", "Spine", "Neck", "Nose")
@@ -210,23 +204,7 @@ _MOST_BYTES = 2_000_000_000
 _FEWEST = 50  # frames
 
 
-@dataclass(frozen=True)
-class Bodies:
-    """Virtual mice in various postures.
-
-    Attributes:
-        pose: (n) poses.
-        girth: (n,) factor of all lengths across the bodies.
-        shape: (n) the bodies.
-    """
-
-    pose: Pose
-    girth: Array
-    shape: BodyShape
-
-    def __getitem__(self, rows: slice) -> Bodies:
-        """A subset of the bodies."""
-        return Bodies(self.pose[rows], self.girth[rows], self.shape[rows])
+Bodies = tuple[Pose, Array, BodyShape]  # poses (n), girth (n,), shapes (n)
 
 
 def evaluate_motion(
@@ -260,7 +238,7 @@ def evaluate_motion(
     above = _height_of(real, skeleton, bodies, along)
     virtual = {
         "walk": _walk(skeleton, along, above, progress),
-        "training": Motion(on_back(skeleton, bodies, along, above)),
+        "training": PointMotion(on_back(skeleton, bodies, along, above)),
     }
     return {"above": above, **motion_figures(real, virtual)}
 
@@ -282,7 +260,7 @@ def in_short(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def read_motion(path: Path, names: Sequence[str], up: str, rate_hz: float | None) -> Motion:
+def read_motion(path: Path, names: Sequence[str], up: str, rate_hz: float | None) -> PointMotion:
     """The five points of a real animal from a file, z up.
 
     Args:
@@ -326,7 +304,7 @@ def read_motion(path: Path, names: Sequence[str], up: str, rate_hz: float | None
         )
     # incomplete frames are breaks
     clips = clips * len(points) + np.cumsum(~whole)
-    return Motion(chosen[whole], clips[whole], rate_hz)
+    return PointMotion(chosen[whole], clips[whole], rate_hz)
 
 
 def _upright(points: Array, columns: list[int], up: str, path: Path) -> Array:
@@ -354,45 +332,45 @@ def _shares(points_mm: Array) -> Array:
     return np.asarray(reach / reach[-1])
 
 
-def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) -> Motion:
+def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) -> PointMotion:
     """A virtual mouse that walks about, in several recordings."""
     points = []
     for k, seed in enumerate(_SEEDS):
         progress(k, len(_SEEDS), "a virtual mouse goes about")
         recording = world_of(skeleton).motion(seed, _PER_RECORDING)
         assert isinstance(recording, SyntheticSession)
-        held = recording.contents
-        assert isinstance(held.shape, BodyShape)
-        own = Bodies(held.pose, held.girth, held.shape.broadcast(_PER_RECORDING))
-        points.append(on_back(skeleton, own, along, above))
+        body = recording.contents
+        assert isinstance(body.shape, BodyShape)
+        shapes = body.shape.broadcast(_PER_RECORDING)
+        points.append(on_back(skeleton, (body.pose, body.girth, shapes), along, above))
     clips = np.repeat(np.arange(len(points)), _PER_RECORDING)
-    return Motion(np.concatenate(points), clips, 1e9 / FRAME_NS)
+    return PointMotion(np.concatenate(points), clips, 1e9 / FRAME_NS)
 
 
 def _postures(skeleton: Skeleton) -> Bodies:
     """Postures as in the models' training."""
-    rng = np.random.default_rng(_POSTURE_SEED)
+    rng, n = np.random.default_rng(_POSTURE_SEED), _N_POSTURES
     species = MouseSpecies(skeleton)
-    n = _N_POSTURES
     shape = species.shapes(rng, "train", n)
     camera_mm = np.full(n, np.mean(species.setting.camera_mm))
     drawn = species.postures(rng, rng.uniform(*species.sizes, n), shape, camera_mm)
-    return Bodies(drawn.pose, drawn.girth, shape)
+    return drawn.pose, drawn.girth, shape
 
 
-def _height_of(real: Motion, skeleton: Skeleton, bodies: Bodies, along: Array) -> float:
+def _height_of(real: PointMotion, skeleton: Skeleton, bodies: Bodies, along: Array) -> float:
     """Height of the real animal's points in a virtual body, as a share of its half height.
 
     It is chosen to match the median arch of the back, since the depth of the points below the fur
     is unknown.
     """
-    wanted = float(np.median(real.posture()["trunk_arch"]))
-    some = bodies[: _N_POSTURES // 8]
+    target = float(np.median(real.posture()["trunk_arch"]))
+    pose, girth, shape = (part[: _N_POSTURES // 8] for part in bodies)
     low, high = 0.0, 1.0
     for _ in range(12):
         above = 0.5 * (low + high)
-        arch = Motion(on_back(skeleton, some, along, above)).posture()["trunk_arch"]
-        low, high = (above, high) if np.median(arch) < wanted else (low, above)
+        points = on_back(skeleton, (pose, girth, shape), along, above)
+        arch = np.median(PointMotion(points).posture()["trunk_arch"])
+        low, high = (above, high) if arch < target else (low, above)
     return round(0.5 * (low + high), 3)
 
 
@@ -408,13 +386,14 @@ def on_back(skeleton: Skeleton, bodies: Bodies, along: Array, above: float) -> A
     Returns:
         (n, P, 3) mm, in the frame of the poses.
     """
-    frames = bodies.pose.frames(skeleton)
+    pose, girth, shape = bodies
+    frames = pose.frames(skeleton)
     joints, upwards = frames.translation, frames.rotation[..., 2]
     reach = joint_reaches(skeleton)
     bone = np.clip(np.searchsorted(reach, along, side="right") - 1, 0, len(reach) - 2)
     share = ((along - reach[bone]) / (reach[bone + 1] - reach[bone]))[:, None]
     axis = joints[:, bone] + share * (joints[:, bone + 1] - joints[:, bone])
     stations = np.asarray(skeleton.surface["stations"], float)
-    half = np.stack([np.interp(along, stations, one) for one in bodies.shape.half_height])
-    rise = above * half * bodies.girth[:, None] * ((along > 0.0) & (along < 1.0))
+    half = np.stack([np.interp(along, stations, one) for one in shape.half_height])
+    rise = above * half * girth[:, None] * ((along > 0.0) & (along < 1.0))
     return np.asarray(axis + rise[..., None] * upwards[:, bone])

@@ -39,14 +39,14 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.sessions import Session
+from liex_lab.simulation import simulator, species
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.simulation.simulator import BodySimulator, world_of
-from liex_lab.simulation.species import unseen
 from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.track import Track
 
 from ..build import build_scene, plan_of
-from ..training.pose_model import estimator_of
+from ..training.motion_model import observed
+from ..training.pose_model import BASELINES, estimator_of, trained_baseline
 
 Array = NDArray[np.float64]
 Subject = PoseEstimator | Baseline
@@ -64,7 +64,7 @@ BUILDS_PROTOCOL = (
     "Rendered recordings of one moving animal each, of a build that no forest was trained on "
     "(the tracker's calibration knows other animals of the same family of builds, and so does what "
     "is said to be left by a fish's own shape; that shape is learned of a wider family, which "
-    "reaches about as far), seen by "
+    "reaches about as far), filmed by "
     "makes of camera of the training's and of focal lengths that it had not, in turn, with "
     "0.7, 1 and 1.5 times their noise; background, floor, animal and size are found by the "
     "product. Beside them the same of builds like the training's. found: share of frames with"
@@ -75,7 +75,7 @@ BUILDS_PROTOCOL = (
     "interval90_z: of these alone; interval90_least: of the worst joint. spearman: rank "
     "correlation of predicted and true error, both of the length. flips: share of poses whose"
     " base-to-tip direction is more than 90 degrees off; longest_flip: most frames in a row. "
-    "p_flip: by classes of the probability told, how many poses, the mean told, and the share"
+    "p_flip: by classes of the predicted probability, how many poses, its mean, and the share"
     " that are. wrong_but_trusted: of the poses that are flagged as trusted, those whose "
     "error is beyond 15 % of the length. length_off: mean of |found / true length - 1|. "
     "height_off_mm: mean over recordings of |mean height error|, and height_bias_mm of the "
@@ -106,8 +106,6 @@ def subject_of(
         PlanError: there is no such variant.
         MissingPackageError: the variant is `cnn` and torch is not installed.
     """
-    from ..training.baselines import BASELINES, trained_baseline
-
     if variant in METHODS:
         return estimator_of(animal, variant, progress, *(() if model is None else (model,)))
     if variant == "paper-one-pose":
@@ -120,7 +118,7 @@ def subject_of(
     raise PlanError(f"there is no variant '{variant}'; known are {known}")
 
 
-def told_by(subject: Subject, found: Estimates | Guesses) -> tuple[Array, Array, Array]:
+def unpacked(subject: Subject, found: Estimates | Guesses) -> tuple[Array, Array, Array]:
     """Unpack a subject's estimates of n frames.
 
     Returns:
@@ -142,9 +140,9 @@ def measure(
     """A subject's estimates in frames (n, H, W) mm, at the size that it estimates from them.
 
     Returns:
-        As `told_by`.
+        As `unpacked`.
     """
-    return told_by(subject, subject.estimate(frames, scene, subject.find_size(frames, scene)))
+    return unpacked(subject, subject.estimate(frames, scene, subject.find_size(frames, scene)))
 
 
 def errors_of(
@@ -202,7 +200,7 @@ def evaluate_pose(
     Raises:
         LiexError: there is no such split or variant.
     """
-    world = world_of(Skeleton.load(animal))
+    world = simulator.world_of(Skeleton.load(animal))
     if split not in world.splits:
         raise LiexError(
             f"there is no split '{split}' to measure poses on; known are {', '.join(world.splits)}"
@@ -353,10 +351,10 @@ def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
     Raises:
         LiexError: the animal's simulator has one build only.
     """
-    world = world_of(Skeleton.load(animal))
-    if not isinstance(world, BodySimulator) or animal not in ("mouse", "fish"):
+    world = simulator.world_of(Skeleton.load(animal))
+    if not isinstance(world, simulator.BodySimulator) or animal not in ("mouse", "fish"):
         raise LiexError(f"the split {OTHER_BUILD} is of mouse and fish, not of '{animal}'")
-    sensors = (*world.species.sensors, *unseen(world.species.sensors))
+    sensors = (*world.species.sensors, *species.unseen(world.species.sensors))
     return world.motion(
         [seed],
         N_FRAMES,
@@ -369,15 +367,13 @@ def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
 
 def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Built:
     """Track a recording as a run does; returned with its truth."""
-    from ..training.motion_model import observed
-
     skeleton = estimator.skeleton
     try:
         each = observed(estimator, plan, OTHER_BUILD, recording)
     except EstimationError:
         lost = Track.empty(skeleton, recording.times_ns)
         return Built(lost, recording.joints_arena, recording.spine_mm, np.nan, skeleton.tip)
-    tracked = track_whole(each.subject, each.seen).track
+    tracked = track_whole(each.subject, each.observations).track
     return Built(tracked, each.truth, recording.spine_mm, each.subject.length_mm, skeleton.tip)
 
 
@@ -429,13 +425,13 @@ def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any
     }
 
 
-def _reliability(told: Array, flipped: NDArray[np.bool_]) -> list[dict[str, Any]]:
+def _reliability(predicted: Array, flipped: NDArray[np.bool_]) -> list[dict[str, Any]]:
     """Number of poses and share of flipped ones by classes of the predicted probability (m,)."""
     rows = []
     for low, high in pairwise(_FLIP_CLASSES):
-        some = (told >= low) & ((told < high) | (high == _FLIP_CLASSES[-1]))
+        some = (predicted >= low) & ((predicted < high) | (high == _FLIP_CLASSES[-1]))
         if some.any():
-            shares = {"told": float(told[some].mean()), "flipped": float(flipped[some].mean())}
+            shares = {"told": float(predicted[some].mean()), "flipped": float(flipped[some].mean())}
             rows.append({"from": low, "to": high, "n": int(some.sum()), **shares})
     return rows
 

@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,7 @@ from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.memory import peak_memory_mb, rest
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions import Provenance, Session, SessionWriter
-from liex_lab.sessions.cutouts import Kept, composed, still_scene
-from liex_lab.sessions.evidence import Results, provenance_of, track_of
-from liex_lab.sessions.mcap import McapWriter
-from liex_lab.sessions.rrd import ReplayWriter
+from liex_lab.sessions import Provenance, Session, SessionWriter, cutouts, evidence, mcap, rrd
 from liex_lab.sessions.writer import ReportMaker
 from liex_lab.tables.rows import Rows, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations
@@ -49,12 +45,11 @@ from ..build import build_recording, build_tracker, kept_estimator
 from ..origin import build_provenance
 from ..session import conclude
 from ..shards import CHUNK, Shard, measure_shards
-from ..study.cluster import measure_cohort
+from ..study.cluster import crew_of
 from ..study.status import standings
-from ..workers import Done, Processes, Work, WorkerPool
-from . import recordings
-from .recordings import as_mcap, evaluate_kinds
-from .speed import FPS, STEP_NS, isolated, looped, to_and_fro
+from ..workers import Done, Processes, Work
+from . import speed
+from .speed import FPS, STEP_NS, as_mcap, evaluate_kinds, isolated, looped, to_and_fro
 
 RunSession = Callable[..., Path]
 
@@ -149,7 +144,7 @@ def evaluate_scale(
         "memory_mb_by_length": memory,
         "simulated_sessions_per_hour": simulate(an_hour, scheduler_s),
         "assumptions": ASSUMPTIONS,
-        "definitions": {**DEFINITIONS, "kinds": recordings.DEFINITIONS},
+        "definitions": {**DEFINITIONS, "kinds": speed.DEFINITIONS},
         "n_frames": n_frames,
     }
 
@@ -212,20 +207,20 @@ def _decode_and_write(
             "0",
             n_frames=len(opened),
             replay_depth=plan.replay.depth,
-            background=still_scene(opened),
+            background=cutouts.still_scene(opened),
         )
-        boxes, background = Kept(session).boxes, origin.background
+        boxes, background = cutouts.Kept(session).boxes, origin.background
         assert boxes is not None
         assert background is not None
-        replay = ReplayWriter(folder / "session.rrd", origin)
-        messages = McapWriter(folder / "session.mcap", origin)
+        replay = rrd.ReplayWriter(folder / "session.rrd", origin)
+        messages = mcap.McapWriter(folder / "session.mcap", origin)
         began = time.perf_counter()
         for frames in opened.chunks(CHUNK):
             times = [frame.time_ns for frame in frames]
             rows = [frame.index for frame in frames]
             cuts = boxes[rows[0] : rows[-1] + 1]
             depth = [
-                composed(frame.depth, cut, background)
+                cutouts.composed(frame.depth, cut, background)
                 for frame, cut in zip(frames, cuts, strict=True)
             ]
             replay.add(rows, times, depth, cuts)
@@ -236,17 +231,15 @@ def _decode_and_write(
     return {"opening": opening, "decode": decode, "bound": time.perf_counter() - began}
 
 
-class _Timed:
+@dataclass(frozen=True)
+class _Timed(Processes):
     """A worker pool that records the completion time and number of frames of each shard."""
 
-    def __init__(self, pool: WorkerPool) -> None:
-        self._pool = pool
-        self.fewest, self.here = pool.fewest, pool.here
-        self.came: list[tuple[float, int]] = []
+    came: list[tuple[float, int]] = field(default_factory=list)
 
     def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
         """Results of the pool; see `WorkerPool`."""
-        for done in self._pool.each(do, works):
+        for done in super().each(do, works):
             n = done.stop - done.start if isinstance(done, Shard) else 0
             self.came.append((time.perf_counter(), n))
             yield done
@@ -264,7 +257,7 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
         whole = Shard(str(recording), plan, tracker, origin, folder, 0, len(opened))
     found = {}
     for name, (count, n_cores) in _CREWS.items():
-        pool = _Timed(Processes(count, threads=1))
+        pool = _Timed(count, threads=1)
         with _on_cores(n_cores):
             measure_shards(pool, whole, folder / f"stretches {name}.liex", silent)
         (begun, _), later = pool.came[count - 1], pool.came[count:]
@@ -309,8 +302,9 @@ def _workers(
     for k, (name, (count, n_cores)) in enumerate(_CREWS.items()):
         study = Study.from_table({**table, "results": f"derivatives/w{k}"}, folder / "study.toml")
         began = time.perf_counter()
-        with _on_cores(n_cores):
-            results = measure_cohort(standings(study), run, workers=count, threads=1)
+        todo = standings(study)
+        with _on_cores(n_cores), crew_of(len(todo), workers=count, threads=1) as crew:
+            results = crew.measure(todo, run)
         wall[name] = time.perf_counter() - began
         each[name] = [result["seconds"] for result in results]
         shutil.rmtree(folder / "derivatives" / f"w{k}")
@@ -348,21 +342,11 @@ def simulate(
     return found
 
 
-@dataclass(frozen=True)
-class _Short:
-    """A short recording: coarser depth images, observations in them, and their subject."""
-
-    depth: list[np.ndarray[Any, Any]]
-    observations: Observations
-    subject: Subject
-    origin: Provenance
-
-
 def write_long(
     minutes: float,
     out: str | Path,
     report: ReportMaker | None = None,
-    told: Callable[[str], None] = lambda what: None,
+    reached: Callable[[str], None] = lambda what: None,
 ) -> dict[str, Any]:
     """Write a session of so many minutes and return its cost.
 
@@ -374,34 +358,40 @@ def write_long(
         minutes: length of the session.
         out: folder in which `long.liex` is written.
         report: makes the report, see `SessionWriter`.
-        told: called with the stage: `began`, `written`, `tracked`, `closed`.
+        reached: called with the stage: `began`, `written`, `tracked`, `closed`.
 
     Returns:
         `peak_memory_mb` of the process and `seconds`.
     """
     plan = Plan.load("mouse")
     n = int(minutes * 60 * FPS)
-    short = _measure_short(plan)
-    origin = replace(short.origin, n_frames=n)
+    depth, observed, subject, origin = _measure_short(plan)
+    origin = replace(origin, n_frames=n)
     rest()
-    told("began")
+    reached("began")
     began = time.perf_counter()
     with SessionWriter(Path(out) / "long.liex", origin, report=report) as writer:
-        for frames, part in _parts(short, n):
+        for frames, part in _parts(depth, observed, n):
             writer.add(frames, observations=part)
-        told("written")
+        reached("written")
         whole = writer.observations(Observations)
-        track = track_whole(short.subject, whole, allocate=writer.allocate)
-        writer.take(track, whole, short.subject)
+        track = track_whole(subject, whole, allocate=writer.allocate)
+        writer.take(track, whole, subject)
         del whole, track
-        told("tracked")
+        reached("tracked")
         conclude(writer, plan, {"prepare": 0.0, "track": 0.0})
-    told("closed")
+    reached("closed")
     return {"peak_memory_mb": peak_memory_mb(), "seconds": time.perf_counter() - began}
 
 
-def _measure_short(plan: Plan) -> _Short:
-    """Render and measure the short recording, without keeping its full depth images."""
+def _measure_short(
+    plan: Plan,
+) -> tuple[list[np.ndarray[Any, Any]], Observations, Subject, Provenance]:
+    """Render and measure the short recording, without keeping its full depth images.
+
+    Returns:
+        Coarser depth images, observations in them, and their subject and provenance.
+    """
     with open_recording(_VIRTUAL.format(seed=5, n=300, sensor="primesense-qvga")) as opened:
         short = looped(opened, len(opened))
     tracker = build_tracker(short, plan)
@@ -409,21 +399,23 @@ def _measure_short(plan: Plan) -> _Short:
     camera = short.camera.every(_COARSER)
     depth = [np.ascontiguousarray(frame.depth[::_COARSER, ::_COARSER]) for frame in short]
     origin = replace(build_provenance(short, plan, tracker), camera=camera, gaps=())
-    return _Short(depth, observed, replace(tracker.subject, camera=camera), origin)
+    return depth, observed, replace(tracker.subject, camera=camera), origin
 
 
-def _parts(short: _Short, n: int) -> Iterator[tuple[list[DepthFrame], Observations]]:
+def _parts(
+    depth: list[np.ndarray[Any, Any]], observed: Observations, n: int
+) -> Iterator[tuple[list[DepthFrame], Observations]]:
     """The frames of a long recording, coarser, and the observations in them."""
-    all_rows = to_and_fro(len(short.depth), n)
+    all_rows = to_and_fro(len(depth), n)
     for start in range(0, n, _BLOCK):
         rows = all_rows[start : start + _BLOCK]
         times = (start + np.arange(len(rows), dtype=np.int64)) * STEP_NS
-        columns = {name: getattr(short.observations, name)[rows] for name in COLUMNS}
-        frames = [
-            DepthFrame(start + k, int(times[k]), short.depth[row]) for k, row in enumerate(rows)
-        ]
-        observed = Observations(short.observations.skeleton, **columns | {"times_ns": times})
-        yield frames, observed
+        columns = {name: getattr(observed, name)[rows] for name in COLUMNS}
+        part = Observations(observed.skeleton, **columns | {"times_ns": times})
+        yield (
+            [DepthFrame(start + k, int(times[k]), depth[row]) for k, row in enumerate(rows)],
+            part,
+        )
 
 
 def evaluate_report(
@@ -473,7 +465,7 @@ def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int,
     time_s = session.frames["time_s"].to_numpy(float)
     round_ns = round(1e9 * float(stop_times(time_s)[-1]))
     n_rounds = max(1, int(np.ceil(seconds * 1e9 / round_ns)))
-    once = track_of(session)
+    once = evidence.track_of(session)
     times_ns, *columns = (
         np.concatenate([getattr(once, column.name)] * n_rounds)
         for column in fields(once)
@@ -486,10 +478,10 @@ def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int,
         bouts.append(session.bouts.copy())
         bouts[k][["start_s", "stop_s"]] += k * round_ns * 1e-9
         bouts[k][["start_frame", "stop_frame"]] += k * len(time_s)
-    origin = provenance_of(session, track.skeleton)
+    origin = evidence.provenance_of(session, track.skeleton)
     whose = (origin.name, origin.individual, (), origin.arena, origin.zones)
     rows = Rows(track, np.arange(track.n_frames), *whose)
-    results = Results(origin, rows)
+    results = evidence.Results(origin, rows)
     behaviour = measure_rows(
         rows,
         *stated_by(session),

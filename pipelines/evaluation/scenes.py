@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,36 +41,11 @@ SEALED_SEEDS: Final = (958_204_331, 958_204_332, 958_204_333)
 N_FRAMES: Final = 300
 
 
-@dataclass(frozen=True)
-class Case:
-    """A row of the table: a scene under a plan.
-
-    Attributes:
-        scene: name of the scene.
-        plan: the bundled plan that it is measured with.
-        beside: the row whose error its own is divided by; '' for none.
-    """
-
-    scene: str
-    plan: str = "mouse"
-    beside: str = "plain"
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Result of a run on a recording.
-
-    Attributes:
-        individuals: of all sessions that were written; () if the run was refused.
-        said: its problems, or the sentence with which it ended.
-        exit_code: of the run.
-    """
-
-    individuals: tuple[Individual, ...]
-    said: tuple[str, ...]
-    exit_code: int
-
-
+Case = tuple[
+    str, str, str
+]  # scene, bundled plan, and the row its error is divided by ('' for none)
+# individuals of all sessions that were written, problems or the sentence of a refusal, exit code
+Outcome = tuple[list[Individual], list[str], int]
 Draw = Callable[[str, "TrueRecording", Sequence["TrueAnimal"], Sequence[Individual]], object]
 
 
@@ -81,11 +55,10 @@ def cases() -> dict[str, Case]:
     Returns:
         Every scene under the plan of its animal, then animals under the plan of another.
     """
-    found = {name: Case(name, plan, beside) for name, (plan, beside) in SCENES.items()}
-    return found | {
-        "mouse-as-hand": Case("plain", "hand", ""),
-        "mouse-as-fish": Case("plain", "fish", ""),
-        "fish-as-mouse": Case("fish", "mouse", ""),
+    return {name: (name, plan, beside) for name, (plan, beside) in SCENES.items()} | {
+        "mouse-as-hand": ("plain", "hand", ""),
+        "mouse-as-fish": ("plain", "fish", ""),
+        "fish-as-mouse": ("fish", "mouse", ""),
     }
 
 
@@ -124,17 +97,17 @@ def evaluate_scenes(
     if not 1 <= n_recordings <= len(seeds):
         raise LiexError(f"of each scene there are 1 to {len(seeds)} recordings, got {n_recordings}")
     chosen = [name for name in every if not only or name in only]
-    wanted = [*dict.fromkeys([*(every[name].beside for name in chosen), *chosen])]
+    needed = {*chosen, *(every[name][2] for name in chosen)}
+    names = [name for name in every if name in needed]
     rows: dict[str, dict[str, Any]] = {}
-    names = [name for name in every if name in wanted]
     for k, name in enumerate(names):
         progress(k, len(names), f"scene {name}")
         rows[name] = _measure_row(name, every[name], seeds[:n_recordings], n_frames, draw)
-        beside = rows.get(every[name].beside, {}).get("mean_joint_error_mm")
+        beside = rows.get(every[name][2], {}).get("mean_joint_error_mm")
         own = rows[name]["mean_joint_error_mm"]
         rows[name]["ratio_to_plain"] = own / beside if own and beside else None
     return {
-        "rows": {name: rows[name] for name in names},
+        "rows": rows,
         "seeds": "sealed" if sealed else list(seeds[:n_recordings]),
         "n_frames": n_frames,
         "protocol": SCENES_PROTOCOL,
@@ -145,23 +118,24 @@ def _measure_row(
     name: str, case: Case, seeds: Sequence[int], n_frames: int, draw: Draw | None
 ) -> dict[str, Any]:
     """Results of one row over some recordings."""
-    plan = plan_of(case.plan)
+    scene, of_plan, _ = case
+    plan = plan_of(of_plan)
     tally = Tally()
     said: list[str] = []
     exit_code = 0
     for k, seed in enumerate(seeds):
-        recording = film(case.scene, seed, n_frames, family="train" if k % 2 else "other")
+        recording = film(scene, seed, n_frames, family="train" if k % 2 else "other")
         # name and length determine the content: it need not be rendered again to be hashed
-        content = hashlib.sha256(f"{recording.name} {n_frames}".encode())
-        recording.files.known_digest = content.hexdigest()
-        truths = recording.animals
-        fits = recording.skeleton.name == plan.animal.skeleton
-        outcome = run_product(recording, plan)
-        tally.add(truths, outcome.individuals, n_frames, recording.skeleton.tip, fits)
-        said += [sentence for sentence in outcome.said if sentence not in said]
-        exit_code = max(exit_code, outcome.exit_code)
+        digest = hashlib.sha256(f"{recording.name} {n_frames}".encode()).hexdigest()
+        recording.files.known_digest = digest
+        truths, skeleton = recording.animals, recording.skeleton
+        individuals, sentences, code = run_product(recording, plan)
+        fits = skeleton.name == plan.animal.skeleton
+        tally.add(truths, individuals, n_frames, skeleton.tip, fits)
+        said += [sentence for sentence in sentences if sentence not in said]
+        exit_code = max(exit_code, code)
         if draw is not None and k == 0:
-            draw(name, recording, truths, outcome.individuals)
+            draw(name, recording, truths, individuals)
     return {**tally.figures(), "said": said, "exit_code": exit_code}
 
 
@@ -174,37 +148,26 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
     quick = plan.with_settings(["replay.depth=none"])
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
         try:
-            refused = _measure(recording, quick, folder)
+            arenas = propose_arenas(recording, quick)
+            if arenas:  # each is a session
+                quick = quick.model_copy(update={"arenas": arenas})
+                outcomes = measure_arenas(recording, quick, folder)
+                refused = [one.error for one in outcomes if one.error is not None]
+            else:
+                measure_session(recording, quick, folder)
+                refused = []
         except LiexError as error:
-            return Outcome((), (str(error),), error.exit_code)
-        sessions = [Session.open(path) for path in sorted(Path(folder).glob("*.liex"))]
-        verdicts = [verdict_in(session.metadata) for session in sessions]
-        return Outcome(
-            tuple(one for session in sessions for one in read_individuals(session)),
-            (
-                *(
-                    sentence
-                    for session, verdict in zip(sessions, verdicts, strict=True)
-                    for sentence in (verdict["sentence"], *session.metadata["problems"])
-                ),
-                *map(str, refused),
-            ),
-            max(
-                MisfitError.exit_code if any(verdict["look_at_it"] for verdict in verdicts) else 0,
-                *(error.exit_code for error in refused),
-                0,
-            ),
-        )
-
-
-def _measure(recording: TrueRecording, plan: Plan, folder: str) -> list[LiexError]:
-    """Measure a recording, each arena as a session; returns the errors of refused arenas."""
-    arenas = propose_arenas(recording, plan)
-    if not arenas:
-        measure_session(recording, plan, folder)
-        return []
-    outcomes = measure_arenas(recording, plan.model_copy(update={"arenas": arenas}), folder)
-    return [one.error for one in outcomes if one.error is not None]
+            return [], [str(error)], error.exit_code
+        individuals: list[Individual] = []
+        said: list[str] = []
+        codes = [0, *(error.exit_code for error in refused)]
+        for path in sorted(Path(folder).glob("*.liex")):
+            session = Session.open(path)
+            verdict = verdict_in(session.metadata)
+            individuals += read_individuals(session)
+            said += [verdict["sentence"], *session.metadata["problems"]]
+            codes.append(MisfitError.exit_code if verdict["look_at_it"] else 0)
+    return individuals, [*said, *map(str, refused)], max(codes)
 
 
 def read_individuals(session: Session) -> list[Individual]:

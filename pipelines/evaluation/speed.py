@@ -18,13 +18,18 @@ import json
 import multiprocessing
 import os
 import platform
+import shutil
 import subprocess
+import tarfile
+import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import import_module
+from pathlib import Path
 from threading import Barrier
 from typing import Any, cast
 
@@ -38,15 +43,33 @@ from liex_lab.errors import LiexError, MissingPackageError
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.estimation.training import base_at_front
+from liex_lab.optics.camera import Camera
+from liex_lab.plan import Plan
+from liex_lab.recordings import open_recording
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.streaming import replayed
+from liex_lab.recordings.writer import McapDepthWriter, PictureFolderWriter, RecordingWriter
 from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
+from liex_lab.sessions import Session
+from liex_lab.sessions.folder import folder_bytes
+from liex_lab.simulation.address import open_synthetic
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.simulator import world_of
 
 from ..build import build_scene, plan_of
-from ..training.pose_model import estimator_of
+from ..convert import convert
+from ..live import follow_live
+from ..training.pose_model import (
+    BASELINES,
+    cached_baseline,
+    estimator_of,
+    trained_baseline,
+    training_of,
+)
 
 N_FRAMES = 128
 N_REPEATS = 5
@@ -64,9 +87,9 @@ _PROTOCOL = (
 LIVE_PROTOCOL = (
     "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at "
     "the camera's pace, forwards and backwards in turn. latency: from when a whole frame had come "
-    "to when its skeleton was told, without a viewer; counted from the first frame on that came "
-    "when all before it had been told, so that learning the background is not in it, and from "
-    "then on every frame. Some frames are followed beforehand, so that all is compiled."
+    "to when its skeleton was reported, without a viewer; counted from the first frame on that "
+    "came when all before it had been reported, so that learning the background is not in it, and "
+    "from then on every frame. Some frames are followed beforehand, so that all is compiled."
 )
 _SEED = 78_001
 FPS = 30
@@ -89,8 +112,8 @@ began = time.perf_counter()
 found = job(*map(json.loads, sys.argv[2:]))
 seconds = time.perf_counter() - began
 from liex_lab.runtime.memory import peak_memory_mb
-told = {"seconds": seconds, "peak_memory_mb": peak_memory_mb() or 0.0}
-print(json.dumps(told | (found if isinstance(found, dict) else {})))
+facts = {"seconds": seconds, "peak_memory_mb": peak_memory_mb() or 0.0}
+print(json.dumps(facts | (found if isinstance(found, dict) else {})))
 """
 
 
@@ -120,10 +143,10 @@ def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str
     Raises:
         LiexError: the process failed.
     """
-    said = [json.dumps(one if isinstance(one, int | float) else str(one)) for one in arguments]
+    words = [json.dumps(one if isinstance(one, int | float) else str(one)) for one in arguments]
     environment = os.environ | dict.fromkeys(_ONE_THREAD if one_thread else (), "1")
     began = time.perf_counter()
-    command = own_python("-c", _CHILD, job, *said)
+    command = own_python("-c", _CHILD, job, *words)
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     seconds = time.perf_counter() - began
     if ran.returncode:
@@ -223,7 +246,6 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         ratios["paper_one_by_one"] = two * best_seconds(one_by_one, N_REPEATS) / N_FRAMES
         progress(3, 5, "timing the stages")
         stages, costs = _stages_and_costs(default, footage)
-    machine = platform.processor() or platform.machine()
     return {
         "animal": animal,
         "frames_per_s_1core": one,
@@ -232,7 +254,7 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
         "ratio_to": ratios,
         "stages_ms": stages,
         "cost_ms": costs,
-        "machine": f"{machine}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
+        "machine": f"{_machine()}, {cores} of {numba.config.NUMBA_NUM_THREADS} cores",
         "protocol": _PROTOCOL.format(
             n=N_FRAMES, pixels=footage.pixels, repeats=N_REPEATS, cores=cores
         ),
@@ -241,8 +263,6 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
 
 def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseline]:
     """The paper's variant, and the baselines that have been trained on this machine."""
-    from ..training.baselines import BASELINES, cached_baseline, trained_baseline, training_of
-
     rivals: dict[str, PoseEstimator | Baseline] = {"paper": estimator_of(animal, "paper", progress)}
     skeleton = Skeleton.load(animal)
     for name in BASELINES:
@@ -254,8 +274,6 @@ def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseli
 
 def _one_by_one(paper: PoseEstimator, footage: Footage) -> NDArray[Any]:
     """Algorithm 1 as published, from frames to candidate scores, without shared steps."""
-    from liex_lab.estimation.training import base_at_front
-
     method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
     crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
     crop_cameras = footage.scene.crop_cameras(crops, method.camera_view)
@@ -353,13 +371,18 @@ def evaluate_live(
     with spawn.Manager() as manager, ProcessPoolExecutor(n_cameras, spawn) as pool:
         together = partial(film, ready=manager.Barrier(n_cameras))
         cameras = list(pool.map(together, range(_SEED, _SEED + n_cameras)))
-    told = {name: [one[name] for one in cameras] for name in _OF_EACH}
+    numbers = {name: [one[name] for one in cameras] for name in _OF_EACH}
     latest = {
-        name: max((one for one in told[name] if one is not None), default=None)
+        name: max((one for one in numbers[name] if one is not None), default=None)
         for name in ("latency_median_ms", "latency_p95_ms")
     }
-    about = {"animal": animal, "rate_hz": cameras[0]["rate_hz"], **latest}
-    return {**about, "cameras": told, "protocol": LIVE_PROTOCOL}
+    return {
+        "animal": animal,
+        "rate_hz": cameras[0]["rate_hz"],
+        **latest,
+        "cameras": numbers,
+        "protocol": LIVE_PROTOCOL,
+    }
 
 
 def _film(
@@ -372,26 +395,21 @@ def _film(
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """The numbers of one camera, which starts when all cameras are ready."""
-    from liex_lab.recordings.streaming import replayed
-
-    from ..live import follow_live
-
     try:
         filmed = world_of(Skeleton.load(animal)).motion(seed, min(_KEPT, n_frames))
         progress(0, None, "rendering frames")
         step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
         plan = plan_of(animal)
-        warm = replayed(arriving[: learn_frames + _WARM], _WARM_SPEED)
-        follow_live(warm, plan, learn_frames=learn_frames)
+        warm = arriving[: learn_frames + _WARM]
+        follow_live(replayed(warm, _WARM_SPEED), plan, learn_frames=learn_frames)
         if ready is not None:
             ready.wait()
     except BaseException:
         if ready is not None:
             ready.abort()  # the others would wait forever
         raise
-    how: dict[str, Any] = {"learn_frames": learn_frames, "progress": progress}
-    numbers, _ = follow_live(replayed(arriving), plan, **how)
+    numbers, _ = follow_live(replayed(arriving), plan, learn_frames=learn_frames, progress=progress)
     return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers}
 
 
@@ -415,3 +433,241 @@ def looped(
 def to_and_fro(n_short: int, n: int) -> NDArray[np.int64]:
     """(n,) index of each frame in the short recording, forwards and backwards."""
     return np.resize([*range(n_short), *range(n_short - 2, 0, -1)], n)
+
+
+# Benchmarks of recording formats: reading speed, and the cost of a whole run.
+
+
+_HOUR = 3600 * FPS  # frames
+_SMALL = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+_VIRTUAL = "synthetic:walk?seed=5&frames={frames}&sensor={sensor}"
+_READING_PROTOCOL = (
+    "rendered depth images of a mouse with a PrimeSense camera's noise ({width} x {height}, {n} "
+    "frames), written by liex_lab and read in a process of its own on one thread; frames a "
+    "second: every frame decoded to float32 millimetres in order, best of {repeats}; opening: "
+    "finding every frame and its time, once; peak memory: of the whole process. An hour's peak is "
+    "that of the full-sized images plus what {hour} frames of 64 x 48 pixels take more than {n} "
+    "of them, because what grows with length is kept per frame, whatever its size"
+)
+DEFINITIONS = {
+    "frames_per_s": (
+        "frames over the seconds from opening the recording to the finished session, all logs, "
+        "tables, figures and the report written; Python's start is in frames_per_s_with_start"
+    ),
+    "report_s": "of these seconds, those after the logs and tables: figures and report",
+    "decoding_frames_per_s_1core": (
+        "the same recording read to float32 millimetres in a process of its own on one thread, "
+        "the mean of once before and once after the run"
+    ),
+    "times_decoding": "frames_per_s over decoding_frames_per_s_1core",
+    "session_share": "bytes of the session's folder over bytes of the recording",
+    "peak_memory_mb": "of the process that ran, everything in it",
+}
+
+
+def write_with(
+    writer: Callable[[Path, Camera], RecordingWriter],
+    path: Path,
+    camera: Camera,
+    frames: Iterable[DepthFrame],
+) -> None:
+    """Write frames by a recording writer."""
+    with writer(path, camera) as out:
+        for frame in frames:
+            out.add(frame)
+
+
+def write_moseq(path: Path, camera: Camera, frames: Iterable[DepthFrame]) -> None:
+    """Write a MoSeq session: depth.dat, depth_ts.txt in milliseconds and metadata.json."""
+    path.mkdir()
+    about = json.dumps({"DepthResolution": [camera.width, camera.height]})
+    (path / "metadata.json").write_text(about, encoding="utf-8")
+    lens = "".join(f"{name} = {getattr(camera, name)}\n" for name in ("fx", "fy", "cx", "cy"))
+    (path / "camera.toml").write_text(f"[camera]\n{lens}", encoding="utf-8")
+    with (path / "depth.dat").open("wb") as depth, (path / "depth_ts.txt").open("w") as stamps:
+        for frame in frames:
+            depth.write(frame.depth.astype("<u2").tobytes())
+            stamps.write(f"{frame.time_ns / 1e6:.6f} 0\n")
+
+
+# name: file, how it is written, and the factor by which an hour is longer than what is written. Ten
+# minutes of images in a folder are 18,000 files, and the other fifty would be like them.
+FORMATS: dict[str, tuple[str, Callable[[Path, Camera, Iterable[DepthFrame]], None], int]] = {
+    "mcap_zstd_raw": ("r.mcap", partial(write_with, McapDepthWriter), 1),
+    "mcap_zstd_png": ("r.mcap", partial(write_with, partial(McapDepthWriter, packing="png")), 1),
+    "png_folder": ("r", partial(write_with, PictureFolderWriter), 6),
+    "moseq_dat": ("r", write_moseq, 1),
+}
+
+
+def evaluate_recordings(
+    *, n_frames: int = 150, n_hour: int = _HOUR, n_repeats: int = 5, progress: Progress = silent
+) -> dict[str, Any]:
+    """Decoding speed and peak memory of every written format, as the protocol states.
+
+    Args:
+        n_frames: frames of each full-sized recording.
+        n_hour: frames of an hour's recording.
+        n_repeats: number of readings of each recording; the best counts.
+        progress: called format by format.
+
+    Returns:
+        By format: `frames_per_s_1core`, `open_ms_per_frame`, `peak_mb`, `peak_mb_of_an_hour`;
+            machine and protocol.
+
+    Raises:
+        LiexError: the process that reads a recording failed.
+    """
+    camera, images = _rendered(progress)
+    size = (16, _SMALL.height, _SMALL.width)
+    small = np.random.default_rng(7).integers(690, 711, size).astype(np.float32)
+    found: dict[str, Any] = {}
+    for k, (name, (file, write, share)) in enumerate(FORMATS.items()):
+        progress(k, len(FORMATS), f"timing {name}")
+        read = []
+        for lens, some, n, repeats in (
+            (camera, images, n_frames, n_repeats),
+            (_SMALL, small, n_frames, 1),
+            (_SMALL, small, n_hour // share, 1),
+        ):
+            with tempfile.TemporaryDirectory(prefix="liex-") as scratch:
+                frames = (DepthFrame(k, (k + 1) * STEP_NS, some[k % len(some)]) for k in range(n))
+                write(Path(scratch) / file, lens, frames)
+                read.append(read_alone(Path(scratch) / file, repeats))
+        full, short, long = read
+        for key, value in {
+            "frames_per_s_1core": full["frames_per_s"],
+            "open_ms_per_frame": full["open_ms_per_frame"],
+            "peak_mb": full["peak_mb"],
+            "peak_mb_of_an_hour": full["peak_mb"]
+            + max(0.0, long["peak_mb"] - short["peak_mb"]) * share,
+        }.items():
+            found.setdefault(key, {})[name] = value
+    facts = {"width": camera.width, "height": camera.height, "n": n_frames, "hour": n_hour}
+    return {
+        **found,
+        "machine": f"{_machine()}, one of {os.cpu_count()} cores",
+        "protocol": _READING_PROTOCOL.format(repeats=n_repeats, **facts),
+    }
+
+
+def _machine() -> str:
+    return platform.processor() or platform.machine()
+
+
+def _rendered(progress: Progress) -> tuple[Camera, NDArray[np.float32]]:
+    """Depth (n, H, W) mm of a rendered recording of 640 x 480 pixels."""
+    recording = open_synthetic(_VIRTUAL.format(frames=30, sensor="primesense"))
+    progress(0, None, "rendering frames")
+    return recording.camera, np.stack([np.round(frame.depth) for frame in recording])
+
+
+def read_alone(path: Path, n_repeats: int = 1) -> dict[str, float]:
+    """Read a recording in a separate process on one thread; the best of `n_repeats` counts.
+
+    Returns:
+        `frames_per_s`, `open_ms_per_frame` and `peak_mb`.
+
+    Raises:
+        LiexError: the process failed.
+    """
+    found = isolated(f"{__name__}:read_all", path, n_repeats, one_thread=True)
+    return {**found, "peak_mb": found["peak_memory_mb"]}
+
+
+def read_all(path: str, n_repeats: int) -> dict[str, float]:
+    """Open a recording and read every frame in order: `frames_per_s` and `open_ms_per_frame`."""
+    began = time.perf_counter()
+    with open_recording(path, strict=True) as recording:
+        opened_s = time.perf_counter() - began
+        seconds = []
+        recording.frame(0)  # loading and compilation for the first frame do not count
+        for _ in range(n_repeats):
+            began = time.perf_counter()
+            for _frame in recording:
+                pass
+            seconds.append(time.perf_counter() - began)
+        return {
+            "frames_per_s": len(recording) / min(seconds),
+            "open_ms_per_frame": 1000.0 * opened_s / len(recording),
+        }
+
+
+def evaluate_kinds(n_frames: int, folder: Path) -> dict[str, Any]:
+    """The cost of a whole run of each kind of recording, after a first run has compiled everything.
+
+    The recordings are written into an empty folder.
+
+    Returns:
+        By kind, the numbers defined in `DEFINITIONS`.
+
+    Raises:
+        LiexError: a run failed.
+    """
+    found: dict[str, Any] = {}
+    for kind, (sensor, write) in KINDS.items():
+        place = folder / kind
+        place.mkdir()
+        with open_recording(_VIRTUAL.format(frames=min(150, n_frames), sensor=sensor)) as short:
+            recording = write(looped(short, n_frames), place)
+        if not found:
+            isolated(f"{__name__}:run_mouse", recording, place / "first")
+        found[kind] = _measured(recording, place / "results")
+        shutil.rmtree(place)
+    return found
+
+
+def run_mouse(recording: str, out: str) -> None:
+    """Run a recording with the plan of the mouse, as `liex run` does."""
+    # by name: jobs do not import the public API, of which this process is a user
+    import_module("liex_lab.api").run_session(recording, Plan.load("mouse"), out)
+
+
+def _measured(recording: Path, out: Path) -> dict[str, float]:
+    """The numbers of one recording and its run."""
+    before = read_alone(recording)
+    ran = isolated(f"{__name__}:run_mouse", recording, out)
+    reads = (before, read_alone(recording))
+    (path,) = out.glob("*.liex")
+    facts = Session.open(path).metadata
+    n, spent = facts["frames"]["n_frames"], facts["timings_s"]
+    decoding, open_ms = (
+        sum(one[name] for one in reads) / 2.0 for name in ("frames_per_s", "open_ms_per_frame")
+    )
+    read_bytes, written_bytes = recording.stat().st_size, folder_bytes(path)
+    return {
+        "frames_per_s": n / ran["seconds"],
+        "frames_per_s_with_start": n / ran["seconds_with_start"],
+        "decoding_frames_per_s_1core": decoding,
+        "times_decoding": n / ran["seconds"] / decoding,
+        "prepare_s": spent["prepare"],
+        "report_s": ran["seconds"] - spent["prepare"] - spent["total"],
+        "opening_s": n * open_ms / 1000.0,
+        "recording_mb": read_bytes / 1e6,
+        "session_mb": written_bytes / 1e6,
+        "session_share": written_bytes / read_bytes,
+        "peak_memory_mb": facts["peak_memory_mb"],
+    }
+
+
+def as_mcap(recording: Recording, place: Path) -> Path:
+    """Write a recording as raw MCAP."""
+    return convert(recording, place / f"{recording.name}.mcap").path
+
+
+def as_moseq(recording: Recording, place: Path) -> Path:
+    """Write a recording like a session packed by MoSeq's extract, as a .tar.gz."""
+    folder, packed = place / "session_walk", place / "session_walk.tar.gz"
+    write_moseq(folder, recording.camera, recording)
+    (folder / "camera.toml").rename(place / "camera.toml")
+    with tarfile.open(packed, "w:gz", compresslevel=6) as archive:  # as tar does
+        for file in sorted(folder.iterdir()):
+            archive.add(file, file.name)
+    shutil.rmtree(folder)
+    return packed
+
+
+KINDS: dict[str, tuple[str, Callable[[Recording, Path], Path]]] = {
+    "mcap_raw_640x480": ("primesense", as_mcap),
+    "moseq_gz_512x424": ("kinect-v2", as_moseq),
+}

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.stats import ttest_ind
 
 from liex_lab.behaviour.cohort import compare
 from liex_lab.runtime.progress import Progress, silent
@@ -119,8 +120,6 @@ def evaluate_statistics(
 
 def error_rates(plan: StudyPlan, n_studies: int, rng: np.random.Generator) -> dict[str, float]:
     """Shares of studies without an effect: p <= 5 %, interval contains 0, mixed model used."""
-    from scipy.stats import ttest_ind
-
     tests = []
     naive = []
     for n in _portions(n_studies):

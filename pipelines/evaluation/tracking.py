@@ -25,7 +25,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,7 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import Segmenter
-from liex_lab.simulation.simulator import world_of
-from liex_lab.simulation.tracking_sequences import TestSequence, tracking_sequence
+from liex_lab.simulation import simulator, tracking_sequences
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.particles import ParticleFilter, ProcessNoise
@@ -52,7 +52,7 @@ from ..build import build_scene, plan_of
 from ..training.pose_model import estimator_of
 
 Array = NDArray[np.float64]
-Draw = Callable[[TestSequence, dict[str, Followed]], object]
+Draw = Callable[[tracking_sequences.TestSequence, dict[str, Followed]], object]
 
 ROWS = {
     "single": "single frames",
@@ -108,11 +108,11 @@ def evaluate_tracking(
         `rows` of results by name, `row_names`, `speed`, `online_lag_frames`, the protocol, and
         `notes` if there are any.
     """
-    world = world_of(Skeleton.load(animal))
+    world = simulator.world_of(Skeleton.load(animal))
     plan = plan_of(animal)
     estimator = estimator_of(animal, "default", progress, *(() if model is None else (model,)))
     rival = estimator_of(animal, "paper", progress) if paper else None
-    recording = tracking_sequence(world, sequence, seed=seed, n_frames=n_frames)
+    recording = tracking_sequences.tracking_sequence(world, sequence, seed=seed, n_frames=n_frames)
     rows, speed = follow_sequence(recording, estimator, plan, progress)
     if rival is not None:
         rows |= paper_rows(recording, rival, plan, progress)
@@ -138,7 +138,10 @@ def evaluate_tracking(
 
 
 def follow_sequence(
-    recording: TestSequence, estimator: PoseEstimator, plan: Plan, progress: Progress = silent
+    recording: tracking_sequences.TestSequence,
+    estimator: PoseEstimator,
+    plan: Plan,
+    progress: Progress = silent,
 ) -> tuple[dict[str, Followed], dict[str, float]]:
     """The rows of a sequence; background, size and animal are estimated as in a run.
 
@@ -181,16 +184,15 @@ def follow_sequence(
     rows["algorithm3"] = follow(
         recording, estimator, tracker.scene, tracker.size, noise, 0, plan.seed
     )
-    for name, job in (("online", _online), ("smoothed", _smoothed)):
+    for name, job in (
+        ("online", _online),
+        ("smoothed", lambda tracker, observed: tracker.track(observed).track),
+    ):
         began = time.perf_counter()
         track = job(tracker, observed)
         rows[name] = row(track, observe_s + time.perf_counter() - began)
     progress(0, n, "timing the tracker")
     return rows, _speed(tracker, recording)
-
-
-def _smoothed(tracker: FrameTracker, observed: Observations) -> Track:
-    return tracker.track(observed).track
 
 
 def _online(tracker: FrameTracker, observed: Observations) -> Track:
@@ -199,7 +201,7 @@ def _online(tracker: FrameTracker, observed: Observations) -> Track:
     return Track.join([part for part in (online.add(observed), online.close()) if part is not None])
 
 
-def _speed(tracker: FrameTracker, recording: TestSequence) -> dict[str, float]:
+def _speed(tracker: FrameTracker, recording: tracking_sequences.TestSequence) -> dict[str, float]:
     """Frames/s of the default tracker, on one core and on all.
 
     From depth images in memory to the smoothed track: the best of alternating repeats over the
@@ -217,7 +219,10 @@ def _speed(tracker: FrameTracker, recording: TestSequence) -> dict[str, float]:
 
 
 def paper_rows(
-    recording: TestSequence, paper: PoseEstimator, plan: Plan, progress: Progress = silent
+    recording: tracking_sequences.TestSequence,
+    paper: PoseEstimator,
+    plan: Plan,
+    progress: Progress = silent,
 ) -> dict[str, Followed]:
     """Algorithms 1 and 3 on a sequence with the parts of the paper's variant, `PAPER_ROWS`."""
     n_sample = plan.foreground.n_background_frames
@@ -233,7 +238,7 @@ def paper_rows(
 
 
 def follow(
-    recording: TestSequence,
+    recording: tracking_sequences.TestSequence,
     estimator: PoseEstimator,
     scene: Segmenter,
     size: float,
@@ -268,7 +273,7 @@ def follow(
 
 
 def _single(
-    recording: TestSequence, paper: PoseEstimator, scene: Segmenter, size: float
+    recording: tracking_sequences.TestSequence, paper: PoseEstimator, scene: Segmenter, size: float
 ) -> Followed:
     """Algorithm 1 on each frame by itself."""
     joints, error = [], []
@@ -283,7 +288,11 @@ def _single(
 
 
 def _followed(
-    recording: TestSequence, estimator: PoseEstimator, joints: Array, error: Array, seconds: float
+    recording: tracking_sequences.TestSequence,
+    estimator: PoseEstimator,
+    joints: Array,
+    error: Array,
+    seconds: float,
 ) -> Followed:
     """A row from joints (n, J, 3) mm in the camera frame and expected errors (n,) mm."""
     skeleton = estimator.skeleton
@@ -318,15 +327,6 @@ def comparison(rows: Mapping[str, Mapping[str, Any]], animal: str) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _Prepared:
-    """A development sequence, ready to be tracked."""
-
-    recording: TestSequence
-    scene: Segmenter
-    size: float
-
-
 def search_noise(
     animal: str, *, n_frames: int | None = None, progress: Progress = silent
 ) -> dict[str, Any]:
@@ -347,29 +347,30 @@ def search_noise(
     """
     estimator = estimator_of(animal, "paper", progress)
     skeleton, plan = estimator.skeleton, plan_of(animal)
-    world = world_of(skeleton)
+    world = simulator.world_of(skeleton)
     sequences = []
-    for kind in _KINDS:
-        for seed in _SEARCH_SEEDS:
-            recording = tracking_sequence(world, kind, seed=seed, n_frames=n_frames)
-            n_sample = plan.foreground.n_background_frames
-            scene, sample = build_scene(recording, plan, skeleton, n_sample)
-            sequences.append(_Prepared(recording, scene, estimator.find_size(sample, scene)))
+    for kind, seed in product(_KINDS, _SEARCH_SEEDS):
+        recording = tracking_sequences.tracking_sequence(world, kind, seed=seed, n_frames=n_frames)
+        n_sample = plan.foreground.n_background_frames
+        scene, sample = build_scene(recording, plan, skeleton, n_sample)
+        sequences.append((recording, scene, estimator.find_size(sample, scene)))
 
-    def mean_mm(follow_one: Callable[[_Prepared], Followed]) -> float:
+    def mean_mm(
+        followed: Callable[[tracking_sequences.TestSequence, Segmenter, float], Followed],
+    ) -> float:
         """Mean error over the frames in view of all sequences."""
-        errors = [
-            follow_one(s).in_view(s.recording.events, s.recording.spine_mm) for s in sequences
-        ]
+        errors = [followed(*s).in_view(s[0].events, s[0].spine_mm) for s in sequences]
         return float(np.concatenate(errors).mean())
 
-    alone = mean_mm(lambda s: _single(s.recording, estimator, s.scene, s.size))
+    alone = mean_mm(lambda recording, scene, size: _single(recording, estimator, scene, size))
     found = {}
     for name, rounds in BASE_ROUNDS.items():
 
         def error_of(noise: ProcessNoise, rounds: int = rounds) -> float:
             return mean_mm(
-                lambda s: follow(s.recording, estimator, s.scene, s.size, noise, rounds, plan.seed)
+                lambda recording, scene, size: follow(
+                    recording, estimator, scene, size, noise, rounds, plan.seed
+                )
             )
 
         tried = _pattern_search(ProcessNoise.of(skeleton.name), error_of, name, progress)
@@ -384,7 +385,7 @@ def search_noise(
         "variant": "paper",
         "kinds": list(_KINDS),
         "seeds": list(_SEARCH_SEEDS),
-        "n_frames": sum(len(s.recording) for s in sequences),
+        "n_frames": sum(len(recording) for recording, *_ in sequences),
         "single_mm": alone,
         "rows": found,
     }

@@ -11,12 +11,10 @@ import signal
 import subprocess
 import threading
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -26,8 +24,7 @@ from liex_lab.runtime.durable import Scratch
 from liex_lab.runtime.text_files import read_toml
 
 from ..workers import n_cores, worker_environment
-from .crew import DEATHS, Crew, Finished, RunSession, Told
-from .status import SessionStatus
+from .crew import DEATHS, Crew
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -35,75 +32,60 @@ if TYPE_CHECKING:
 
 
 _FORGOTTEN_S = 8.0  # a nanny whose process is gone for so long does not start another one by itself
+WORKERS_EVERY_S = 5.0  # between two checks of this machine's workers
 _NONE_LEFT_S = 60.0  # give up after all worker processes of a study are gone for so long
 _CLOSING = ("closing", "closed", "closing_gracefully")
 
 
-class Watch(ABC):
-    """A context in which a thread checks the cluster periodically.
+@contextmanager
+def watched(client: Client, inspect: Callable[[], str], every_s: float) -> Iterator[None]:
+    """A context in which a thread inspects the cluster periodically.
 
-    Attributes:
-        gave_up: why the study is ended; empty if it is not.
+    Args:
+        client: of the cluster; its pending futures are the remaining sessions.
+        inspect: repairs what can be repaired; returns why the study has to end, or ''.
+        every_s: time between two inspections, s.
+
+    Raises:
+        StudyError: this thread ended the study.
     """
+    from distributed import Future
 
-    def __init__(self, client: Client, every_s: float) -> None:
-        """Prepare to check every `every_s` s; pending futures of the client are remaining
-        sessions.
-        """
-        self.gave_up = ""
-        self._client, self._every_s = client, every_s
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="cluster watch", daemon=True)
+    over = threading.Event()
+    reasons: list[str] = []
 
-    @abstractmethod
-    def look(self) -> None:
-        """Check once: repair what can be repaired, or state in `gave_up` why it cannot."""
-
-    def __enter__(self) -> Self:
-        """Start checking."""
-        self._thread.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
-        """Stop checking.
-
-        Raises:
-            StudyError: this thread ended the study.
-        """
-        self._over.set()
-        self._thread.join()
-        if self.gave_up and isinstance(error, StudyError):
-            raise StudyError(self.gave_up) from None
-
-    def _watch(self) -> None:
-        from distributed import Future
-
-        while not self._over.wait(self._every_s):
-            self.look()
-            if self.gave_up:
-                self._client.cancel([Future(key, self._client) for key in self._client.futures])
+    def watch() -> None:
+        while not over.wait(every_s):
+            if reason := inspect():
+                reasons.append(reason)
+                client.cancel([Future(key, client) for key in client.futures])
                 return
 
+    thread = threading.Thread(target=watch, name="cluster watch", daemon=True)
+    thread.start()
+    try:
+        yield
+    except StudyError:
+        if reasons:
+            raise StudyError(reasons[0]) from None
+        raise
+    finally:
+        over.set()
+        thread.join()
 
-class KeptWorkers(Watch):
-    """Worker processes of this machine.
+
+class KeptWorkers:
+    """Worker processes of this machine, those of a `distributed.LocalCluster`.
 
     Dask's nanny restarts a worker that died, unless it died while starting.
     """
 
-    def __init__(self, client: Client, cluster: Any, every_s: float = 5.0) -> None:
-        """Watch the workers of a `distributed.LocalCluster` every `every_s` seconds."""
-        super().__init__(client, every_s)
+    def __init__(self, cluster: Any) -> None:
         self._cluster = cluster
         self._gone_since: dict[Any, float] = {}  # by nanny
 
-    def look(self) -> None:
-        """Restart workers that their nannies do not, and give up if there are none for a minute."""
+    def inspect(self) -> str:
+        """Restart workers that their nannies do not; '' unless none is left for a minute."""
         nannies = list(self._cluster.workers.values())
         now = time.monotonic()
         gone = [nanny for nanny in nannies if not _is_alive(nanny)]
@@ -112,23 +94,21 @@ class KeptWorkers(Watch):
         for nanny, seconds in waited.items():
             if seconds >= _FORGOTTEN_S and nanny.status.name not in _CLOSING:
                 self._cluster.loop.add_callback(nanny.instantiate)
-        if len(gone) == len(nannies) and min(waited.values(), default=_NONE_LEFT_S) >= _NONE_LEFT_S:
-            self.gave_up = (
-                "the study's worker processes have ended and could not be started again; see "
-                "whether the machine has memory left, or use fewer workers; the sessions that were "
-                "measured are kept, and the same command goes on with the rest"
-            )
+        if len(gone) < len(nannies) or min(waited.values(), default=_NONE_LEFT_S) < _NONE_LEFT_S:
+            return ""
+        return (
+            "the study's worker processes have ended and could not be started again; see "
+            "whether the machine has memory left, or use fewer workers; the sessions that were "
+            "measured are kept, and the same command goes on with the rest"
+        )
 
 
 def _is_alive(nanny: Any) -> bool:
     """Whether the process of a Dask nanny is running."""
     import psutil
 
-    pid = nanny.pid
-    if not pid:
-        return False
     try:
-        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+        return bool(nanny.pid) and psutil.Process(nanny.pid).status() != psutil.STATUS_ZOMBIE
     except psutil.Error:
         return False
 
@@ -211,7 +191,7 @@ MOST_IN_VAIN = 3
 def queued() -> set[str] | None:
     """Numbers of this account's waiting or running jobs; None if Slurm does not answer."""
     try:
-        told = subprocess.run(  # nosec B607: Slurm is on the cluster's PATH
+        listed = subprocess.run(  # nosec B607: Slurm is on the cluster's PATH
             ["squeue", "--me", "--noheader", "--format=%A"],
             capture_output=True,
             text=True,
@@ -220,42 +200,25 @@ def queued() -> set[str] | None:
         )
     except (OSError, subprocess.SubprocessError):
         return None
-    return set(told.stdout.split())
+    return set(listed.stdout.split())
 
 
-class KeptJobs(Watch):
-    """A context with as many jobs as sessions are left, up to the requested number."""
+class KeptJobs:
+    """As many jobs of a `dask_jobqueue.SLURMCluster` as sessions are left, up to a number."""
 
-    def __init__(
-        self,
-        client: Client,
-        cluster: Any,
-        n_jobs: int,
-        log_folder: str | None,
-        ask: Callable[[], set[str] | None] = queued,
-    ) -> None:
-        """Watch the jobs of a cluster.
-
-        Args:
-            client: of the cluster; its pending futures are the remaining sessions.
-            cluster: a `dask_jobqueue.SLURMCluster`.
-            n_jobs: number of requested jobs.
-            log_folder: folder of the jobs' logs, if one was named.
-            ask: returns the waiting and running jobs.
-        """
-        super().__init__(client, EVERY_S)
-        self._cluster, self._n_jobs = cluster, n_jobs
+    def __init__(self, client: Client, cluster: Any, n_jobs: int, log_folder: str | None) -> None:
+        """Keep up to `n_jobs` jobs, whose logs are in `log_folder`."""
+        self._client, self._cluster, self._n_jobs = client, cluster, n_jobs
         self._logs = log_folder or "the folder where the command was started"
-        self._ask = ask
         self._missing: set[str] = set()  # jobs that were not queued at the last check
         self._in_vain = 0
 
-    def look(self) -> None:
+    def inspect(self) -> str:
         """Forget jobs that ended without connecting, and request others if needed."""
         cluster = self._cluster
-        there = self._ask()
+        there = queued()
         if there is None:
-            return
+            return ""
         if cluster.scheduler_info["workers"]:
             self._in_vain = 0
         numbers = {name: str(job.job_id) for name, job in dict(cluster.workers).items()}
@@ -267,53 +230,33 @@ class KeptJobs(Watch):
         for name in silent:
             cluster.loop.add_callback(cluster.workers.pop, name, None)
         if self._in_vain > MOST_IN_VAIN * self._n_jobs:
-            self.gave_up = (
+            return (
                 f"{self._in_vain} jobs of Slurm ended before they measured anything; their logs "
                 f"are in {self._logs}; the sessions that were measured are kept, and the same "
                 "command goes on with the rest"
             )
-            return
         left = sum(state.status == "pending" for state in dict(self._client.futures).values())
         if len(numbers) - len(silent) < min(self._n_jobs, left):
             cluster.scale(self._n_jobs)
+        return ""
 
 
 _ENCRYPTED, _OPEN = ("tls", "wss"), ("tcp", "ws", "ucx")  # protocols of a scheduler's address
 
 
-def measure_cohort(
-    todo: Sequence[SessionStatus],
-    run: RunSession,
-    *,
-    workers: int = 0,
-    threads: int = 0,
-    scheduler: str | None = None,
-    slurm: SlurmTable | None = None,
-    told: Told = lambda *_: None,
-    finished: Finished = lambda _: None,
-) -> list[dict[str, Any]]:
-    """Measure the sessions of a study; returns a result per session, see `measure_one`.
-
-    Args:
-        todo: the sessions to measure.
-        run: measures a recording, `liex_lab.api.run_session`.
-        workers: processes on this machine; 0 means one for every two cores.
-        threads: cores of each; 0 means an equal share.
-        scheduler: address of a running Dask scheduler.
-        slurm: how to request workers from a Slurm cluster.
-        told: called with id, pieces done, pieces in total, and the current step.
-        finished: called with each result as it arrives.
+def is_encrypted(scheduler: str) -> bool:
+    """Whether traffic to a scheduler's address, as in tcp://10.0.0.1:8786, is encrypted.
 
     Raises:
-        StudyError: no scheduler answers, or it ends before the study does.
-        MissingPackageError: workers on Slurm need dask-jobqueue, which is not installed.
+        StudyError: it is not the address of a scheduler.
     """
-    if not todo:
-        return []
-    with crew_of(len(todo), workers=workers, threads=threads, scheduler=scheduler, slurm=slurm) as (
-        crew
-    ):
-        return crew.measure(todo, run, told, finished)
+    kind, found, place = scheduler.rpartition("://")  # tcp if not stated
+    if not place or (found and kind not in _ENCRYPTED + _OPEN):
+        raise StudyError(
+            f"{scheduler!r} is no address of a Dask scheduler; expected one as in "
+            "tcp://10.0.0.1:8786 or tls://10.0.0.1:8786, which `dask scheduler` prints"
+        )
+    return kind in _ENCRYPTED
 
 
 @contextmanager
@@ -338,30 +281,6 @@ def crew_of(
         StudyError: no scheduler answers, or it ends before the study does.
         MissingPackageError: workers on Slurm need dask-jobqueue, which is not installed.
     """
-    with _client(n_tasks, workers, threads, scheduler, slurm) as client:
-        yield Crew(client, slurm.jobs if slurm else 0)
-
-
-def is_encrypted(scheduler: str) -> bool:
-    """Whether traffic to a scheduler's address, as in tcp://10.0.0.1:8786, is encrypted.
-
-    Raises:
-        StudyError: it is not the address of a scheduler.
-    """
-    kind, found, place = scheduler.rpartition("://")  # tcp if not stated
-    if not place or (found and kind not in _ENCRYPTED + _OPEN):
-        raise StudyError(
-            f"{scheduler!r} is no address of a Dask scheduler; expected one as in "
-            "tcp://10.0.0.1:8786 or tls://10.0.0.1:8786, which `dask scheduler` prints"
-        )
-    return kind in _ENCRYPTED
-
-
-@contextmanager
-def _client(
-    n_tasks: int, workers: int, threads: int, scheduler: str | None, slurm: SlurmTable | None
-) -> Iterator[Client]:
-    """A client of the requested cluster."""
     import dask
     from distributed import Client
 
@@ -385,7 +304,8 @@ def _client(
         stack.enter_context(dask.config.set(settings))
         if scheduler is not None:
             try:
-                yield stack.enter_context(Client(scheduler, timeout="20s", set_as_default=False))
+                client = Client(scheduler, timeout="20s", set_as_default=False)
+                yield Crew(stack.enter_context(client))
             except (OSError, ValueError, TypeError) as error:
                 raise StudyError(
                     f"no Dask scheduler answers at {scheduler} ({error}); start one with `dask "
@@ -401,30 +321,23 @@ def _client(
         )
         stack.enter_context(cluster)
         client = stack.enter_context(Client(cluster, set_as_default=False))
-        if not slurm:
-            stack.enter_context(KeptWorkers(client, cluster))
-        else:
+        if slurm:
             n_jobs = min(slurm.jobs, n_tasks)  # a job is one worker
             cluster.scale(n_jobs)
-            stack.enter_context(KeptJobs(client, cluster, n_jobs, slurm.log_folder))
+            jobs = KeptJobs(client, cluster, n_jobs, slurm.log_folder)
+            stack.enter_context(watched(client, jobs.inspect, EVERY_S))
+        else:
+            stack.enter_context(watched(client, KeptWorkers(cluster).inspect, WORKERS_EVERY_S))
         try:
-            yield client
+            yield Crew(client, slurm.jobs if slurm else 0)
         except BaseException:
-            if not slurm:
-                _end_workers(cluster)
+            # a request to end would wait for a kernel; sessions resume from their checkpoints
+            for nanny in () if slurm else cluster.workers.values():
+                nanny.close_gracefully()  # otherwise it starts another one
+                if nanny.pid:
+                    with suppress(ProcessLookupError):
+                        os.kill(nanny.pid, signal.SIGKILL)
             raise
-
-
-def _end_workers(cluster: Any) -> None:
-    """Kill the worker processes of this machine.
-
-    A request to end would wait for a kernel, and a session resumes from its checkpoint either way.
-    """
-    for nanny in cluster.workers.values():
-        nanny.close_gracefully()  # otherwise it starts another one
-        if nanny.pid:
-            with suppress(ProcessLookupError):
-                os.kill(nanny.pid, signal.SIGKILL)
 
 
 def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
@@ -489,9 +402,8 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
 
 def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
     """The options of one job: a worker that measures a session at a time on all its cores."""
-    exports = [
-        f"export {name}={value}" for name, value in worker_environment(table.cores_per_job).items()
-    ]
+    threads = worker_environment(table.cores_per_job)
+    exports = [f"export {name}={value}" for name, value in threads.items()]
     exports.append("export DASK_DISTRIBUTED__WORKER__HTTP__ROUTES='[]'")
     return {
         "queue": table.partition,
@@ -502,7 +414,10 @@ def slurm_options(table: SlurmTable, scratch: str) -> dict[str, Any]:
         "job_cpu": table.cores_per_job,
         "walltime": table.walltime,
         "interface": table.interface,
-        "job_script_prologue": [*table.prologue, *exports],
+        "job_script_prologue": [
+            *table.prologue,
+            *exports,
+        ],
         "job_extra_directives": list(table.directives),
         "local_directory": table.local_folder or scratch,
         "log_directory": table.log_folder,

@@ -8,7 +8,6 @@ during which more than three workers died is quarantined.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -29,7 +28,7 @@ from liex_lab.sessions.folder import (
 from liex_lab.sessions.verdict import read_verdict
 
 from ..workers import Done, Work, WorkerPool
-from .sharing import LOOKING, LookAtSession, Stage, about, input_stamp
+from .sharing import LOOKING, LookAtSession, Stage, about, input_stamp, read_document
 from .status import SessionStatus, to_look_at
 
 if TYPE_CHECKING:
@@ -60,103 +59,102 @@ def measure_one(
         pool: workers for the session's shards.
 
     Returns:
-        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None if done),
-        `corrections_taken_from` (the outdated session whose manual corrections were copied; "" for
-        none), and `look_at_it` (why a session that is done needs review; "" for nothing).
+        `id`, `state` (`done` or `failed`), `seconds`, `failure` (None if done); of a session that
+        was measured also `corrections_taken_from` (the outdated session whose manual corrections
+        were copied; "" for none), and `look_at_it` (why it needs review; "" for nothing).
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
     began = time.perf_counter()
     stage = Stage(progress)
-    failure = None
     try:
         if not session.recording_exists:
             raise RecordingError(
                 f"there is no recording {session.recording}; correct its path, or copy it there"
             )
-        stamp = input_stamp(session.recording)
+        problems = {"problems": [session.remark]} if session.remark else {}
         run(
             session.recording,
             session.plan,
             folder=session.folder,
             overwrite=True,
             notes={
-                "input": {"stamp": stamp},
+                "input": {"stamp": input_stamp(session.recording)},
                 "run_id": run_id,
-                **({"problems": [session.remark]} if session.remark else {}),
+                **problems,
             },
             pool=pool,
             progress=stage,
         )
     except Exception as error:
         failure = describe_failure(error, stage.name, stage.frame) | {"run_id": run_id}
-        quarantine(session, failure)
-    seconds = round(time.perf_counter() - began, 3)
+        return quarantine(session, failure) | {"seconds": round(time.perf_counter() - began, 3)}
     return {
-        "id": session.id,
-        "state": "failed" if failure else "done",
-        "seconds": seconds,
-        "failure": failure,
-        "corrections_taken_from": "" if failure else taken_from(session.folder),
-        "look_at_it": "" if failure else to_look_at(read_verdict(session.folder)),
+        **_result(session, "done"),
+        "seconds": round(time.perf_counter() - began, 3),
+        "corrections_taken_from": taken_from(session.folder),
+        "look_at_it": to_look_at(read_verdict(session.folder)),
     }
+
+
+def _result(
+    session: PlannedSession, state: str, failure: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    return {"id": session.id, "state": state, "seconds": 0.0, "failure": failure}
 
 
 def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
     """The session's result if it ended in this run already, before its worker could report it."""
     failure = read_failure(session.folder)
     if failure and failure.get("run_id") == run_id:
-        return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
-    try:
-        document = json.loads((session.folder / "session.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    same = isinstance(document, dict) and document.get("run_id") == run_id
-    return {"id": session.id, "state": "done", "seconds": 0.0, "failure": None} if same else None
+        return _result(session, "failed", failure)
+    same = read_document(session.folder).get("run_id") == run_id
+    return _result(session, "done") if same else None
 
 
-def quarantine(session: PlannedSession, failure: dict[str, Any]) -> None:
+def quarantine(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
     """Write failed.json into the session's folder, and set older results aside.
 
-    The file contains plan and input, to detect changes.
+    The file contains plan and input, to detect changes. Returns the session's result.
     """
     known = {
         "session_id": session.id,
         **failure,
         "plan": session.plan.model_dump(exclude_none=True),
+        "input": {"stamp": input_stamp(session.recording)},
     }
-    known["input"] = {"stamp": input_stamp(session.recording)}
     set_outdated(session.folder)
     write_failure(session.folder, known)
+    return _result(session, "failed", failure)
 
 
 TOPIC = "liex-progress"
 DEATHS = 3  # deaths of workers that are tolerated before a session is blamed
-_TOLD_EVERY_S = 0.5
+_REPORT_EVERY_S = 0.5
 
 # session, pieces done, pieces in total, current step
-Told = Callable[[str, int, int | None, str], None]
+Report = Callable[[str, int, int | None, str], None]
 Finished = Callable[[dict[str, Any]], None]  # the result of `measure_one`
 
 
 class Crew:
     """The workers of a study.
 
-    Args:
+    Attributes:
         client: of their cluster.
-        n_jobs: number of workers that are yet to connect; 0 if all are connected.
     """
 
     def __init__(self, client: Client, n_jobs: int = 0) -> None:
-        self._client, self._n_jobs = client, n_jobs
-        self._told: Told = lambda *_: None
-        client.subscribe_topic(TOPIC, lambda event: self._told(*event[1]))
+        """`n_jobs` workers are yet to connect; 0 if all are connected."""
+        self.client, self._n_jobs = client, n_jobs
+        self._report: Report = lambda *_: None
+        client.subscribe_topic(TOPIC, lambda event: self._report(*event[1]))
 
     def measure(
         self,
         todo: Sequence[SessionStatus],
         run: RunSession,
-        told: Told = lambda *_: None,
+        report: Report = lambda *_: None,
         finished: Finished = lambda _: None,
     ) -> list[dict[str, Any]]:
         """Measure sessions; returns a result per session, see `measure_one`.
@@ -164,19 +162,19 @@ class Crew:
         Args:
             todo: the sessions.
             run: measures a recording, `liex_lab.api.run_session`.
-            told: called with id, pieces done, pieces in total, and the current step.
+            report: called with id, pieces done, pieces in total, and the current step.
             finished: called with each result as it arrives.
         """
-        shared = n_shared(len(todo), self._n_jobs or len(self._client.nthreads()))
+        shared = n_shared(len(todo), self._n_jobs or len(self.client.nthreads()))
         planned = [one.session for one in todo]
         task = partial(_on_worker, run)
-        return self._each(planned, task, "measuring", _quarantined, told, finished, shared)
+        return self._each(planned, task, "measuring", quarantine, report, finished, shared)
 
     def look_at(
         self,
         sessions: Sequence[PlannedSession],
         look: LookAtSession,
-        told: Told = lambda *_: None,
+        report: Report = lambda *_: None,
         finished: Finished = lambda _: None,
     ) -> list[dict[str, Any]]:
         """Inspect sessions; returns the findings on each animal, see `sharing.look_at`.
@@ -184,11 +182,16 @@ class Crew:
         Args:
             sessions: the sessions.
             look: inspects one session, `sharing.look_at`.
-            told: called with id, pieces done, pieces in total, and the current step.
+            report: called with id, pieces done, pieces in total, and the current step.
             finished: called with each result as it arrives.
         """
-        task = partial(_look_on_worker, look)
-        return self._each(sessions, task, LOOKING, _not_seen, told, finished)
+
+        def unobserved(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
+            return about(session) | {"failure": failure}
+
+        return self._each(
+            sessions, partial(_look_on_worker, look), LOOKING, unobserved, report, finished
+        )
 
     def _each(
         self,
@@ -196,22 +199,22 @@ class Crew:
         task: Callable[[PlannedSession, str, bool], dict[str, Any]],
         stage: str,
         died: Callable[[PlannedSession, dict[str, Any]], dict[str, Any]],
-        told: Told,
+        report: Report,
         finished: Finished,
         shared: int = 0,
     ) -> list[dict[str, Any]]:
         """Result of the task for each session, or of `died` if its workers ended in this stage."""
         from distributed import CancelledError, as_completed
 
-        self._told = told
+        self._report = report
         run_id = f"{os.getpid()}-{time.monotonic_ns()}"
         alone = len(planned) - shared
         sessions = {f"{session.id}-{run_id}": session for session in planned}
         submitted = [
-            self._client.submit(task, session, run_id, k >= alone, key=key, pure=False)
+            self.client.submit(task, session, run_id, k >= alone, key=key, pure=False)
             for k, (key, session) in enumerate(sessions.items())
         ]
-        completed = as_completed(submitted, loop=self._client.loop)
+        completed = as_completed(submitted, loop=self.client.loop)
         del submitted
         results = []
         for future in completed:
@@ -242,15 +245,6 @@ def n_shared(n: int, n_workers: int) -> int:
     return n % max(n_workers, 1)
 
 
-def _quarantined(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
-    quarantine(session, failure)
-    return {"id": session.id, "state": "failed", "seconds": 0.0, "failure": failure}
-
-
-def _not_seen(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
-    return about(session) | {"failure": failure}
-
-
 def _why_died(error: BaseException, stage: str) -> dict[str, Any]:
     failure = describe_failure(error, stage, None)
     if type(error).__name__ == "KilledWorker":
@@ -269,32 +263,31 @@ def _on_worker(
     run: RunSession, session: PlannedSession, run_id: str, shared: bool
 ) -> dict[str, Any]:
     """The task: measure one session and report to the client; `shared` uses all workers."""
-    return measure_one(session, run, _teller(session), run_id, Workers() if shared else None)
+    return measure_one(session, run, _reporter(session), run_id, Workers() if shared else None)
 
 
 def _look_on_worker(
     look: LookAtSession, session: PlannedSession, run_id: str, shared: bool
 ) -> dict[str, Any]:
     """The task: inspect one session, which is too short to share among workers."""
-    return look(session, _teller(session))
+    return look(session, _reporter(session))
 
 
-def _teller(session: PlannedSession) -> Progress:
-    """A progress callback that reports to the client of the study."""
+def _reporter(session: PlannedSession) -> Progress:
+    """A progress callback that reports to the client of the study, at most twice a second."""
     from distributed import get_worker
 
     worker = get_worker()
     last = 0.0
 
-    def tell(done: int, total: int | None, what: str) -> None:
-        """Send `done`, `total` and `what` to the client, at most twice a second."""
+    def send(done: int, total: int | None, what: str) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last > _TOLD_EVERY_S:
+        if now - last > _REPORT_EVERY_S:
             last = now
             worker.log_event(TOPIC, [session.id, done, total, what])
 
-    return tell
+    return send
 
 
 class Workers:

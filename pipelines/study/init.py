@@ -198,8 +198,8 @@ def name_sessions(stated: Mapping[Path, str], raw: Path) -> tuple[list[Named], l
     taken = set()
     spelled: dict[str, str] = {}
     notes = []
-    for path, told in stated.items():
-        found = find_subject(path, told, raw)
+    for path, name in stated.items():
+        found = find_subject(path, name, raw)
         by_name = find_subject(path, "", raw)
         if by_name.origin and same(by_name.id) != same(found.id):
             notes.append(
@@ -246,8 +246,7 @@ def _text(root: Path, named: Sequence[Named], notes: Sequence[str]) -> str:
         origins = dict.fromkeys(o or "nothing, so check it" for a, _, _, o in named if a == one)
         blocks.append(_ANIMAL.format(id=_quoted(one), origins=", ".join(origins)))
     for animal, session, path, _ in named:
-        recording = path.relative_to(root).as_posix()
-        texts = (_quoted(text) for text in (animal, session, recording))
+        texts = (_quoted(text) for text in (animal, session, path.relative_to(root).as_posix()))
         blocks.append(_SESSION.format(*texts))
     return "\n".join(blocks)
 

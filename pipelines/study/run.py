@@ -7,25 +7,175 @@ A lock in the study's cohort folder prevents a second run.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from liex_lab.errors import StudyError
-from liex_lab.plan.study import PlannedSession, Study
-from liex_lab.runtime.durable import locked
-from liex_lab.runtime.places import unlinked_below
-from liex_lab.runtime.progress import Board
-from liex_lab.sessions.corrections import Description
+import pandas as pd
 
+from liex_lab.errors import LiexError, StudyError
+from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
+from liex_lab.runtime import durable, places, text_files
+from liex_lab.runtime.progress import Board
+from liex_lab.sessions import Session, verdict
+from liex_lab.sessions.corrections import Description
+from liex_lab.sessions.folder import FAILED_FILE, read_failure
+from liex_lab.tables.schema import dictionary, table_columns, write_table
+
+from ..compare import find_sessions
 from ..compiling import compile_ahead
 from .cluster import SlurmTable, crew_of, is_encrypted
 from .crew import Crew, RunSession
-from .listing import write_study_table
-from .sharing import LookAtSession, look_at, to_be_looked_at, write_look
-from .status import SessionStatus, standings
+from .sharing import LookAtSession, look_at, read_document, to_be_looked_at, write_look
+from .status import SessionStatus, standings, to_look_at
+
+
+def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[verdict.Entry]]]:
+    """The name of a study, and a function that lists its sessions from disk at each call.
+
+    `place` is a study's .toml file, a folder with a study.toml, or a folder with sessions in it.
+
+    Raises:
+        StudyError: there is no such file or folder.
+        SessionError: the folder contains no session.
+    """
+    path = Path(place)
+    if path.is_file() or (path / STUDY_FILE).is_file():
+        study = Study.load(path)
+        return study.name, lambda: [_of_study(one) for one in standings(Study.load(study.path))]
+    if not path.is_dir():
+        raise StudyError(
+            f"there is no study {path}; name a study's .toml file, or a folder with sessions in it"
+        )
+    find_sessions([path])  # raises an error if there is none
+    return path.resolve().name, lambda: _of_folder(path)
+
+
+def _of_study(one: SessionStatus) -> verdict.Entry:
+    session, failure = one.session, one.failure or {}
+    who = {name: getattr(session.animal, name) for name in verdict.WHO[1:]}
+    return verdict.Entry(
+        session.id,
+        one.state,
+        one.reason or session.remark,
+        str(failure.get("remedy", "")),
+        session.folder if (session.folder / "session.json").is_file() else None,
+        {"subject_id": session.animal.id, **who},
+    )
+
+
+def _of_folder(path: Path) -> list[verdict.Entry]:
+    """Every session in a folder, measured or failed.
+
+    Keys are session names, or relative paths where names recur.
+    """
+    entries = [_measured(folder) for folder in find_sessions([path])]
+    for file in sorted(path.rglob(FAILED_FILE)):
+        failure = read_failure(file.parent) or {}
+        reason, remedy = (str(failure.get(name, "")) for name in ("reason", "remedy"))
+        name = file.parent.relative_to(path).as_posix()
+        entries.append(verdict.Entry(name, "failed", reason, remedy))
+    names = [entry.key for entry in entries]
+    return [
+        entry
+        if names.count(entry.key) == 1 or entry.folder is None
+        else replace(entry, key=entry.folder.relative_to(path.resolve()).as_posix())
+        for entry in entries
+    ]
+
+
+def _measured(folder: Path) -> verdict.Entry:
+    try:
+        session = Session.open(folder)
+        known = session.table("sessions").iloc[0].reindex([*verdict.WHO]).to_dict()
+        reason = to_look_at(verdict.verdict_in(session.metadata))
+    except LiexError as error:
+        return verdict.Entry(folder.name, "failed", str(error))
+    who = {name: value for name, value in known.items() if isinstance(value, str) and value}
+    return verdict.Entry(session.name, "done", reason, folder=folder, who=who)
+
+
+# The study's table: every session with its status, as CSV for spreadsheets and Parquet for
+# programs.
+
+
+TABLE = "study"
+STUDY_SESSIONS = table_columns(TABLE)
+
+
+def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
+    """Write study.parquet, study.csv and study_columns.json; returns the path of the CSV."""
+    folder = study.cohort_folder
+    places.unlinked_below(study.results, folder).mkdir(parents=True, exist_ok=True)
+    rows = study_rows(study, standings)
+    names = [column.name for column in STUDY_SESSIONS]
+    block = {name: [row[name] for row in rows] for name in names}
+    with durable.replacing(folder / f"{TABLE}.parquet") as part:
+        write_table(part, STUDY_SESSIONS, [block], {"study": study.name})
+    table = pd.DataFrame(rows, columns=names, dtype=object).map(text_files.harmless)
+    csv = table.to_csv(index=False, lineterminator="\n", na_rep="nan")
+    durable.write_whole(folder / f"{TABLE}.csv", csv)
+    entries = [entry for entry in dictionary(STUDY_SESSIONS) if entry["table"] == TABLE]
+    text = json.dumps(entries, indent=1, ensure_ascii=False)
+    durable.write_whole(folder / f"{TABLE}_columns.json", text + "\n")
+    return folder / f"{TABLE}.csv"
+
+
+def study_rows(study: Study, standings: Sequence[SessionStatus]) -> list[dict[str, Any]]:
+    """One row per session with the columns of `STUDY_SESSIONS`; paths are relative to the study."""
+    rows = []
+    for one in standings:
+        session, failure = one.session, one.failure or {}
+        document = read_document(session.folder) if one.state == "done" else {}
+        counted = document.get("frames")
+        frames = counted if isinstance(counted, dict) else {}
+        row = {
+            "session_id": session.id,
+            "subject_id": session.animal.id,
+            **{name: getattr(session.animal, name) for name in ("group", "cage", "sex", "batch")},
+            "state": one.state,
+            "reason": one.reason,
+            "shared": _shared(session),
+            "remedy": str(failure.get("remedy", "")),
+            "stage": str(failure.get("stage") or ""),
+            "frame": _count(failure.get("frame"), -1),
+            "n_frames": _count(frames.get("n_frames"), 0),
+            "n_frames_observed": _count(frames.get("n_observed"), 0),
+            "observed_s": _number(frames.get("observed_s")),
+            "frames_per_s": _number(document.get("frames_per_s")),
+            "peak_memory_mb": _number(document.get("peak_memory_mb")),
+            "recording": _below(study, session.recording),
+            "folder": _below(study, str(session.folder)),
+        }
+        rows.append(row)
+    return rows
+
+
+def _shared(session: PlannedSession) -> str:
+    shared = session.plan.animal.shared
+    if shared is None:
+        return session.remark
+    length = "" if shared.spine_mm is None else f"{shared.spine_mm:.1f} mm long, "
+    shape = "the average shape" if shared.shape is None else "a shape of its own"
+    return f"{length}{shape}, by {shared.by}"
+
+
+def _below(study: Study, path: str) -> str:
+    inside = Path(path).is_relative_to(study.folder)
+    return Path(path).relative_to(study.folder).as_posix() if inside else path
+
+
+def _count(value: Any, otherwise: int) -> int:
+    return value if isinstance(value, int) else otherwise
+
+
+def _number(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) else float("nan")
+
 
 # writes descriptions into a session, with their author: `liex_lab.api.correct_session`
 DescribeSession = Callable[..., Path]
@@ -81,9 +231,9 @@ def run_study(
     unseen = to_be_looked_at(study, only, retry, again)
     written = [*(one.session.folder for one in before), *(session.folder for session in unseen)]
     for place in (study.cohort_folder, *written):
-        unlinked_below(study.results, place)
+        places.unlinked_below(study.results, place)
     study.cohort_folder.mkdir(parents=True, exist_ok=True)
-    with locked(
+    with durable.locked(
         study.cohort_folder / ".lock",
         f"the study {study.name} is being measured by another process",
     ):
@@ -93,8 +243,8 @@ def run_study(
                 before = ask()
             for one in before:
                 if one.described:
-                    said = [Description(key, value) for key, value in one.described.items()]
-                    describe(one.session.folder, said, author=f"study {study.name}")
+                    descriptions = [Description(key, value) for key, value in one.described.items()]
+                    describe(one.session.folder, descriptions, author=f"study {study.name}")
             if (todo := _to_measure(before)) and crew:
                 _measure(todo, run, crew, board)
         after = standings(study)
@@ -137,9 +287,8 @@ def _look(
 
         def finished(found: dict[str, Any]) -> None:
             """Store the findings on a session, and report them to the board."""
-            id = found["session_id"]
+            id, failure = found["session_id"], found.get("failure")
             write_look(known[id], found)
-            failure = found.get("failure")
             sentence = (
                 f"could not be looked at: {failure['reason']}"
                 if failure

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from stat import S_ISDIR
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,7 @@ from liex_lab.estimation.session_shape import PLACES
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import N_PLACES, Factor, Positive, SharedBody, SharedShape
 from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
-from liex_lab.runtime.durable import write_whole
-from liex_lab.runtime.places import storable_document, unlinked
+from liex_lab.runtime import durable, places
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import in_background
 from liex_lab.sessions.corrections import DESCRIBED
@@ -51,27 +51,32 @@ LookAtSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the cont
 _SAYS = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}
 
 
+def read_document(folder: Path) -> dict[str, Any]:
+    """The session.json of a folder; {} if it is absent or cannot be read."""
+    try:
+        found = json.loads((folder / "session.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:
     """Why a stored session.json, failed.json or look.json differs from the plan; '' if it does not.
 
     Raises:
         PlanError: the stored plan is not valid.
     """
-    return (
-        _version_changed(document)
-        or plan_changed(session.plan, document.get("plan", {}))
-        or _model_changed(session.plan, document.get("model", {}))
-        or _input_changed(session, document.get("input", {}))
-    )
-
-
-def _version_changed(document: dict[str, Any]) -> str:
     then = document.get("versions", {}).get("liex_lab", "")
     if then != (now := package_version("liex_lab")):
         return f"version changed: {then or 'unknown'}, now {now}"
-    schema = document.get("schema_version", SCHEMA_VERSION)
-    same = schema == SCHEMA_VERSION
-    return "" if same else f"version changed: session schema {schema}, now {SCHEMA_VERSION}"
+    if (schema := document.get("schema_version", SCHEMA_VERSION)) != SCHEMA_VERSION:
+        return f"version changed: session schema {schema}, now {SCHEMA_VERSION}"
+    if why := plan_changed(session.plan, document.get("plan", {})):
+        return why
+    model = document.get("model", {})
+    if model and model.get("sha256") != sha256(find_model(session.plan.estimation.model)):
+        return "model changed"
+    return _input_changed(session, document.get("input", {}))
 
 
 def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
@@ -84,23 +89,23 @@ def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
         shared = plan.animal.shared
         length = "" if shared is None or shared.spine_mm is None else f", {shared.spine_mm:g} mm"
         now["animal"]["shared"] = "nothing" if shared is None else f"by {shared.by}{length}"
+    skipped = {"report", *(f"session.{key}" for key in DESCRIBED)}  # do not affect measurements
+    values, before = (
+        {
+            f"{section}.{key}" if key else section: value
+            for section, part in plan.items()
+            for key, value in (part.items() if isinstance(part, dict) else [("", part)])
+            if section not in skipped
+        }
+        for plan in (now, then)
+    )
     differing = [
-        f"{section}.{key} = {now[section][key]}"
-        if isinstance(now[section], dict)
-        else f"{section} = {now[section]}"
-        for section in now
-        for key in (now[section] if isinstance(now[section], dict) else [""])
-        if (now[section][key] != then[section][key] if key else now[section] != then[section])
-        and not (section == "session" and key in DESCRIBED)
-        and section != "report"  # does not affect measurements
+        f"{name} = {value}"
+        for name, value in values.items()
+        if value != before.get(name) and name not in skipped
     ]
     more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
     return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""
-
-
-def _model_changed(plan: Plan, stored: dict[str, Any]) -> str:
-    same = not stored or sha256(find_model(plan.estimation.model)) == stored.get("sha256")
-    return "" if same else "model changed"
 
 
 def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
@@ -133,19 +138,16 @@ def input_stamp(recording: str) -> str:
     path = Path(recording)
     if not path.exists():
         return ""
-    folder = path if path.is_dir() else path.parent
+    whole = path.is_dir()
+    folder = path if whole else path.parent
     entries = []
-    for inside, _, names in os.walk(folder):
-        for name in names:
-            file = Path(inside, name)
-            try:
+    for file in folder.rglob("*") if whole else folder.iterdir():
+        if whole or file == path or file.suffix.lower() in _SAYS:
+            with suppress(OSError):  # it has just been removed
                 found = file.stat()
-            except OSError:
-                continue
-            if path.is_dir() or file == path or file.suffix.lower() in _SAYS:
-                entries.append([str(file.relative_to(folder)), found.st_size, found.st_mtime_ns])
-        if not path.is_dir():
-            break
+                if not S_ISDIR(found.st_mode):
+                    name = str(file.relative_to(folder))
+                    entries.append([name, found.st_size, found.st_mtime_ns])
     return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
 
 
@@ -160,11 +162,6 @@ class _ShapeFound(_Part):
     width: list[float] = []
     height: list[float] = []
     joints_moved: list[list[float]] = []
-
-    @property
-    def stated(self) -> dict[str, Any]:
-        """The shape in the format of a plan."""
-        return self.model_dump(include={"width", "height", "joints_moved"})
 
 
 class _AnimalFound(_Part):
@@ -182,28 +179,19 @@ class _Look(_Part):
     stated: bool
 
 
-@dataclass(frozen=True)
-class Shared:
-    """A session with its shared size and shape.
+def shared_sessions(study: Study) -> list[tuple[PlannedSession, str]]:
+    """The sessions of a study, in order, with size and shape shared by the stored findings.
 
-    Attributes:
-        session: the planned session; its plan has the shared values, or its remark states why there
-            are none.
-        waits_for: id of a session of its animal that has to be inspected first; empty if all were.
+    Returns:
+        Each session, whose plan has the shared values or whose remark states why there are none;
+        and the id of a session of its animal that has to be inspected first; '' if all were.
     """
-
-    session: PlannedSession
-    waits_for: str = ""
-
-
-def shared_sessions(study: Study) -> list[Shared]:
-    """The sessions of a study, in order, with size and shape shared by the stored findings."""
-    known = {session.id: Shared(session) for session in study.sessions}
+    known = {session.id: (session, "") for session in study.sessions}
     for group in _groups(study):
         looks: dict[str, Any] = {session.id: read_look(session) for session in group}
         missing = next((id for id, look in looks.items() if look is None), "")
         members = group if missing else together(group, looks)
-        known |= {session.id: Shared(session, missing) for session in members}
+        known |= {session.id: (session, missing) for session in members}
     return list(known.values())
 
 
@@ -250,9 +238,8 @@ def together(
     taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
     alone = f"The sessions of {subject} do not share size and shape"
     if len(taking_part) < 2:
-        n = len(taking_part)
-        seen = "none of them" if n == 0 else "one of them alone"
-        return [replace(s, remark=f"{alone}: {seen} shows the animal.") for s in group]
+        shown_by = "one of them alone" if taking_part else "none of them"
+        return [replace(s, remark=f"{alone}: {shown_by} shows the animal.") for s in group]
     found = list(taking_part.values())
     if (spread := spread_of(found)) > MOST_APART:
         lengths = sorted(one.spine_mm for one in found)
@@ -267,19 +254,19 @@ def together(
         n_sessions=len(found),
         spine_mm=None if agreed.spine_mm is None else round(agreed.spine_mm, _MM_DECIMALS),
         girth=None if agreed.girth is None else round(agreed.girth, _DECIMALS),
-        shape=None if agreed.shape is None else _stated(agreed.shape),
+        shape=None if agreed.shape is None else _shape(agreed.shape),
     )
+    animals = {s.id: s.plan.animal.model_copy(update={"shared": body}) for s in group}
     return [
-        replace(s, plan=_with(s.plan, body))
+        replace(s, plan=s.plan.model_copy(update={"animal": animals[s.id]}))
         if s.id in taking_part
-        else replace(s, remark=_left_out(s, looks[s.id]))
+        else replace(
+            s,
+            remark=f"{s.id} does not share size and shape with the other sessions of {subject}: "
+            f"{_why_not(looks[s.id])}.",
+        )
         for s in group
     ]
-
-
-def _with(plan: Plan, body: SharedBody) -> Plan:
-    animal = plan.animal.model_copy(update={"shared": body})
-    return plan.model_copy(update={"animal": animal})
 
 
 def _why_not(look: Mapping[str, Any]) -> str:
@@ -289,36 +276,29 @@ def _why_not(look: Mapping[str, Any]) -> str:
     return ", and ".join(map(str, look["misfits"]))
 
 
-def _left_out(session: PlannedSession, look: Mapping[str, Any]) -> str:
-    return (
-        f"{session.id} does not share size and shape with the other sessions of "
-        f"{session.animal.id}: {_why_not(look)}."
-    )
-
-
 def found_in(look: Mapping[str, Any]) -> Found:
     """The findings on an animal, from `look_at` of a session that shows it.
 
     Raises:
         ValueError: it is damaged.
     """
-    told = _Look.model_validate(look)
-    shape = told.animal.shape or _ShapeFound()
-    stated = SharedShape.model_validate(shape.stated) if shape.kept else None
+    read = _Look.model_validate(look)
+    shape = read.animal.shape or _ShapeFound()
+    stated = shape.model_dump(include={"width", "height", "joints_moved"})
     return Found(
-        told.animal.spine_mm,
-        told.stated,
-        told.log_sd,
-        told.n_frames,
-        told.animal.girth,
-        None if stated is None else shape_labels(stated),
+        read.animal.spine_mm,
+        read.stated,
+        read.log_sd,
+        read.n_frames,
+        read.animal.girth,
+        shape_labels(SharedShape.model_validate(stated)) if shape.kept else None,
         # a shape was tried, and rejected on held-out frames
         not shape.kept and shape.residual_mm is not None,
         shape.n_frames,
     )
 
 
-def _stated(labels: Any) -> SharedShape:
+def _shape(labels: Any) -> SharedShape:
     p = len(PLACES)
     return SharedShape(
         width=np.exp(labels[-2 * p : -p]).round(_DECIMALS).tolist(),
@@ -404,8 +384,10 @@ def look_file(session: PlannedSession) -> Path:
 def write_look(session: PlannedSession, look: dict[str, Any]) -> None:
     """Write the findings on a session atomically."""
     file = look_file(session)
-    unlinked(file.parent).mkdir(parents=True, exist_ok=True)
-    write_whole(file, json.dumps(storable_document(look), indent=1, default=str) + "\n")
+    places.unlinked(file.parent).mkdir(parents=True, exist_ok=True)
+    durable.write_whole(
+        file, json.dumps(places.storable_document(look), indent=1, default=str) + "\n"
+    )
 
 
 def read_look(session: PlannedSession) -> dict[str, Any] | None:

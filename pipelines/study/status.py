@@ -12,6 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import pandas as pd
+
+from liex_lab.behaviour.cohort import unified
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import PlannedSession, Study
@@ -84,9 +87,9 @@ def standings(
             f"{', '.join(known[:8]) or 'none'}"
         )
     found = [
-        standing(one.session, one.waits_for)
-        for one in shared_sessions(study)
-        if not only or one.session.id in only
+        standing(session, waits_for)
+        for session, waits_for in shared_sessions(study)
+        if not only or session.id in only
     ]
     return [_asked_again(one, retry, again) for one in found]
 
@@ -127,28 +130,24 @@ def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
 
 def _measured(session: PlannedSession, file: Path) -> SessionStatus:
     """The status of a session that has results: whether these are up to date."""
-    said: dict[str, str] = {}
+    described: dict[str, str] = {}
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
         why = what_changed(session, document)
-        said = {} if why else _described_anew(session, document)
+        described = {} if why else _described_anew(session, document)
     except (OSError, ValueError, LiexError, AttributeError, TypeError, KeyError, RecursionError):
         why = "its session.json cannot be read"
-    if said:
-        told = ", ".join(f"{key} = {value or 'unknown'}" for key, value in said.items())
-        why = f"described anew: {told}; nothing is measured again"
+    if described:
+        listed = ", ".join(f"{key} = {value or 'unknown'}" for key, value in described.items())
+        why = f"described anew: {listed}; nothing is measured again"
     if why:
-        return SessionStatus(session, "changed", why, described=said)
+        return SessionStatus(session, "changed", why, described=described)
     input = str(document.get("input", {}).get("sha256", ""))
     return SessionStatus(session, "done", to_look_at(verdict_in(document)), input=input)
 
 
 def to_check(found: Sequence[SessionStatus]) -> list[str]:
     """Possible errors in a study's animals: two names of one, or a recording listed twice."""
-    import pandas as pd
-
-    from liex_lab.behaviour.cohort import unified
-
     sessions = [one.session for one in found if one.state != "excluded"]
     animals = {one.animal.id: one.animal.model_dump(exclude={"set"}) for one in sessions}
     table = pd.DataFrame(animals.values()).rename(columns={"id": "subject_id"})
@@ -185,13 +184,13 @@ def to_look_at(verdict: Mapping[str, Any]) -> str:
     Returns:
         The session's own wording; '' if there is nothing to report.
     """
-    said = []
+    sentences = []
     if verdict["look_at_it"]:
         accepted = ", accepted" if verdict["accepted"] else ""
-        said.append(f"{LOOK_AT_IT}{accepted}: {'; '.join(map(str, verdict['reasons']))}")
+        sentences.append(f"{LOOK_AT_IT}{accepted}: {'; '.join(map(str, verdict['reasons']))}")
     if verdict["cautions"]:
-        said.append(f"{CAUTION}: {'; '.join(map(str, verdict['cautions']))}")
-    return ". ".join(said)
+        sentences.append(f"{CAUTION}: {'; '.join(map(str, verdict['cautions']))}")
+    return ". ".join(sentences)
 
 
 def _described_anew(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:

@@ -9,31 +9,359 @@ sampling: it ranks the segments to label next by the entropy of the recogniser's
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
+from liex_lab.actions import learning, storage, vocabulary
+from liex_lab.actions.ethogram import UNLABELLED
+from liex_lab.actions.labels import LabelledTrack, read_labels, sessions_named, words_of
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.errors import LiexError
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.exchange.boris import boris_export_labels, boris_labels, is_boris_export
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene.height_maps import Patches
+from liex_lab.sessions import Session
 from liex_lab.sessions.evidence import track_of, wall_of
-from liex_lab.simulation.agents import fish, mouse
+from liex_lab.simulation import agents
+from liex_lab.simulation._render_kernels import WALL_COLUMNS
+from liex_lab.simulation.agents import fish as fish_acts
+from liex_lab.simulation.agents import mouse as mouse_acts
+from liex_lab.simulation.agents.agent import STEP_S, CameraPath, Individual, Motion, render_agent
+from liex_lab.simulation.fish import FishSpecies
+from liex_lab.simulation.species import MouseSpecies
+from liex_lab.tracking.observations import COLUMNS, Observations
+from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.track import Subject
+from liex_lab.tracking.tracker import PatchObserver
 
-from .agent_tracks import Scenario
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from liex_lab.actions.labels import LabelledTrack
-    from liex_lab.actions.timeline import TimelineModel
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.sessions import Session
-
+from .pose_model import cache_folder, estimator_of
 
 Array = NDArray[np.float64]
+
+_WALL_ERROR_MM = 4.0  # error of the estimated arena
+_FISH_STRIDE = 4
+_FISH_WINDOW = 128
+_MOUSE_WINDOW = 112
+_SIZE_FRAMES = 128  # frames in which an animal's size is measured
+_WAYS = 2  # hypotheses per frame: only the animal is in view
+_CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A recording to generate.
+
+    Attributes:
+        animal: `fish` or `mouse`.
+        individual: the animal's own seed: traits, size, shape.
+        seed: of everything else in the recording.
+        rate_hz: frames per second of the camera.
+        seconds: length of an uncut recording, s; 0 for a cut-out action.
+        word: the cut-out action, '' for an uncut recording.
+        novel: the individual has traits outside the training's.
+        filmed_s: length of the beginning that is filmed, s; 0 films all of it.
+    """
+
+    animal: str
+    individual: int
+    seed: int
+    rate_hz: float
+    seconds: float = 0.0
+    word: str = ""
+    novel: bool = False
+    filmed_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class AgentTrack:
+    """The single-frame observations of a generated recording of n frames, with labels and truth.
+
+    Attributes:
+        observations: hypotheses of all frames, arena frame.
+        subject: the animal and its camera.
+        words: (n,) true actions.
+        animal: name of the individual.
+        wall_mm: (n,) distance of its middle from the nearest wall, mm; NaN if unknown.
+        truth: (n, J, 3) float32 true joints, mm, arena frame.
+        cut: the cut-out action, which has some frames before and after it as well; '' for an uncut
+            recording.
+    """
+
+    observations: Observations
+    subject: Subject
+    words: NDArray[np.str_]
+    animal: str
+    wall_mm: Array
+    truth: NDArray[np.float32]
+    cut: str = ""
+
+    def tracked(self, rate_hz: float = 0.0) -> LabelledTrack:
+        """The labelled track of the recording; for a cut-out action, only its frames.
+
+        Args:
+            rate_hz: frame rate of a slower camera, simulated by the frames nearest to its times; 0
+                uses all frames.
+        """
+        rows = (
+            np.arange(len(self.words))
+            if not rate_hz
+            else thinned(self.observations.times_ns, rate_hz)
+        )
+        thinned_out = Observations(
+            self.observations.skeleton,
+            *(getattr(self.observations, name)[rows] for name in COLUMNS),
+        )
+        track = track_whole(self.subject, thinned_out).track
+        one = LabelledTrack(
+            track, self.words[rows], self.animal, self.wall_mm[rows], self.truth[rows].astype(float)
+        )
+        return one[one.words == self.cut] if self.cut else one
+
+
+def thinned(times_ns: NDArray[np.int64], rate_hz: float) -> NDArray[np.int64]:
+    """Unique rows (m,) of the frames at times (n,), ns, nearest to those of another frame rate."""
+    times = (times_ns - times_ns[:1]) * 1e-9
+    wanted = np.arange(0.0, times[-1] + 1e-9, 1.0 / rate_hz)
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    return np.unique(np.where(wanted - times[after - 1] < times[after] - wanted, after - 1, after))
+
+
+def acted_tracks(
+    scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
+) -> list[LabelledTrack]:
+    """The labelled tracks of scenarios, by the present tracker; see `acted`."""
+    return [one.tracked() for one in acted(scenarios, estimator, progress)]
+
+
+def acted(
+    scenarios: Sequence[Scenario], estimator: PoseEstimator, progress: Progress = silent
+) -> list[AgentTrack]:
+    """Single-frame observations of all scenarios, from the cache or measured now.
+
+    Cut-outs of one individual share its measured size and one file of the cache.
+
+    Args:
+        scenarios: all uncut, or all cut-out actions, of one animal.
+        estimator: measures the frames; its model's digest is part of the cache key.
+        progress: called recording by recording, if any has to be measured.
+
+    Returns:
+        One for each scenario, in their order.
+    """
+    found: dict[int, AgentTrack] = {}
+    made_by = estimator.model.digest()
+    whole = bool(scenarios[0].seconds)
+    for name in dict.fromkeys((k if whole else one.individual) for k, one in enumerate(scenarios)):
+        rows = [name] if whole else [k for k, one in enumerate(scenarios) if one.individual == name]
+        group = [scenarios[k] for k in rows]
+        animal = group[0].animal
+        key = hashlib.sha256((repr(group) + made_by).encode() + _generator(animal)).hexdigest()[:16]
+        path = cache_folder() / "acted" / f"{animal}-seen-{key}.npz"
+        if not path.is_file():
+            sizes: dict[int, float] = {}
+            measured: list[AgentTrack] = []
+            for one in group:
+                progress(
+                    len(found) + len(measured), len(scenarios), "acting, rendering and measuring"
+                )
+                measured.append(act(one, estimator, sizes))
+            _save(path, measured)
+        found |= dict(zip(rows, _load(path, estimator, group), strict=True))
+    return [found[k] for k in range(len(scenarios))]
+
+
+def act(
+    scenario: Scenario, estimator: PoseEstimator, sizes: dict[int, float] | None = None
+) -> AgentTrack:
+    """Generate, render and measure one scenario frame by frame.
+
+    Args:
+        scenario: the recording to generate.
+        estimator: measures the frames.
+        sizes: cache of size over home size by individual; others are measured over up to 128 frames
+            and added. None starts empty.
+    """
+    rng = np.random.default_rng([scenario.individual, scenario.seed])
+    stage = staged(scenario, rng)
+    motion, rows, pose, _, _, species, camera, _, wall_mm = stage
+    window_px = _FISH_WINDOW if scenario.animal == "fish" else _MOUSE_WINDOW
+    tracker = PatchObserver(estimator)
+    sizes = {} if sizes is None else sizes
+    n_sample = 1 if scenario.individual in sizes else min(_SIZE_FRAMES, len(rows))
+    some = np.linspace(0, len(rows) - 1, n_sample).astype(int)
+    (sample,) = rendered(rng, stage, some, window_px)
+    if scenario.individual not in sizes:
+        sizes[scenario.individual] = tracker.find_size(sample)
+    size = sizes[scenario.individual]
+    n = len(rows)
+    if scenario.filmed_s:
+        n = int(np.searchsorted(rows * STEP_S, scenario.filmed_s))
+    times = np.round(rows[:n] * STEP_S * 1e9).astype(np.int64)
+    whole = Camera(*camera.intrinsics, *(int(x) for x in camera.picture))
+    return AgentTrack(
+        tracker.observe(rendered(rng, stage, slice(n), window_px), times, size),
+        tracker.subject(whole, sample.floor(0).T_arena_camera, size),
+        motion.word[rows[:n]],
+        f"{scenario.animal}-{scenario.individual}",
+        wall_mm[:n],
+        pose[:n].joints(species.skeleton).astype(np.float32),
+        scenario.word,
+    )
+
+
+Staged = tuple[
+    Motion,
+    NDArray[np.int64],
+    Pose,
+    Array,
+    Array | None,
+    FishSpecies | MouseSpecies,
+    CameraPath,
+    BodyShape,
+    Array,
+]
+
+
+def staged(scenario: Scenario, rng: np.random.Generator) -> Staged:
+    """Generate a scenario, without rendering it.
+
+    Args:
+        scenario: the recording to generate.
+        rng: random number generator, of the individual and the scenario.
+
+    Returns:
+        The motion on its 5 ms clock; its steps (n,) that are frames; poses (n), arena frame; girth
+        (n,); the wall that each frame shows, or None; species, camera and shape; distance (n,) from
+        the nearest wall, mm, NaN if unknown.
+    """
+    return {"fish": _fish, "mouse": _mouse}[scenario.animal](scenario, rng)
+
+
+def rendered(
+    rng: np.random.Generator, stage: Staged, rows: slice | NDArray[np.int64], window_px: int
+) -> Iterator[Patches]:
+    """Depth around the animal in some frames of a generated scenario."""
+    _, _, pose, girth, walls, species, camera, shape, _ = stage
+    near = None if walls is None else walls[rows]
+    return render_agent(rng, species, camera, shape, pose[rows], girth[rows], near, window_px)
+
+
+def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
+    """A fish in a tank: its motion, poses and camera."""
+    species = FishSpecies()
+    own = np.random.default_rng([scenario.individual, 0])
+    fish = Individual.draw(own, (25.0 / 30.0, 34.0 / 30.0), scenario.novel)
+    shape = species.shapes(own, "train", 1)
+    assert isinstance(shape, BodyShape)
+    height_mm = float(rng.uniform(300.0, 330.0))
+    water = fish_acts.depth_of_water(species, shape, fish.size, height_mm)
+    actor = fish_acts.FishActor(fish, fish.size * species.skeleton.length, water, height_mm)
+    motion = actor.cut(rng, scenario.word) if scenario.word else actor.uncut(rng, scenario.seconds)
+    rows = motion.at(scenario.rate_hz)
+    pose = fish_acts.fish_poses(rng, species, motion, rows, fish.size)
+    camera = CameraPath.draw(rng, species, species.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
+    girth, wall_mm = np.full(len(rows), fish.size), np.full(len(rows), np.nan)
+    return motion, rows, pose, girth, None, species, camera, shape, wall_mm
+
+
+def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
+    """A mouse in a box: its motion, poses, girth, camera, and wall distances, mm."""
+    species = MouseSpecies()
+    own = np.random.default_rng([scenario.individual, 0])
+    mouse = Individual.draw(own, (0.95, 1.3), scenario.novel)
+    shape = species.shapes(own, "train", 1)
+    half = rng.uniform([290.0, 250.0], [400.0, 330.0])
+    actor = mouse_acts.MouseActor.of(mouse, species.skeleton, shape, half)
+    motion = actor.uncut(rng, scenario.seconds)
+    rows = motion.at(scenario.rate_hz)
+    pose, girth = mouse_acts.mouse_poses(rng, species, motion, rows, mouse.size, shape)
+    middle = pose.joints(species.skeleton)[..., :2].mean(axis=1)
+    sensor = species.sensors[int(rng.integers(len(species.sensors)))]
+    camera = CameraPath.draw(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
+    wall_mm = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
+    # in some training recordings the walls are unknown
+    if not scenario.novel and rng.random() >= 0.75:
+        wall_mm = np.full(len(rows), np.nan)
+    walls = _walls(rng, middle, half)
+    return motion, rows, pose, girth, walls, species, camera, shape, wall_mm
+
+
+def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
+    """The wall nearest to each position (n, 2) mm, as columns (n, WALL_COLUMNS) of the renderer."""
+    walls = np.zeros((len(middle), WALL_COLUMNS))
+    axis = np.argmin(half - np.abs(middle), axis=1)
+    rows = np.arange(len(middle))
+    walls[rows, axis] = np.where(middle[rows, axis] < 0, -1.0, 1.0)
+    walls[:, 2] = half[axis]
+    walls[:, 3] = rng.uniform(100.0, 300.0)
+    walls[:, 4] = rng.uniform(0.0, 8.0)
+    walls[:, 5] = rng.uniform(6.0, 20.0)
+    return walls
+
+
+def _generator(animal: str) -> bytes:
+    """SHA-256 of the code that generates and renders the behaviour."""
+    folder = Path(agents.__file__).parent
+    content = b"".join((folder / name).read_bytes() for name in ("agent.py", f"{animal}.py"))
+    return hashlib.sha256(content).digest()
+
+
+def _save(path: Path, group: list[AgentTrack]) -> None:
+    subjects = [one.subject for one in group]
+    columns: dict[str, Any] = {
+        "lengths": [len(one.words) for one in group],
+        "animals": [one.animal for one in group],
+        "camera": [[getattr(one.camera, name) for name in _CAMERA] for one in subjects],
+        "camera_turn": [one.T_arena_camera.rotation for one in subjects],
+        "camera_shift": [one.T_arena_camera.translation for one in subjects],
+        "sizes": [one.subject.length_mm / one.observations.skeleton.length for one in group],
+    }
+    for name in ("words", "wall_mm", "truth"):
+        columns[name] = np.concatenate([getattr(one, name) for one in group])
+    for name in COLUMNS:
+        values = np.concatenate([getattr(one.observations, name) for one in group])
+        # without the hypotheses of a second object in view
+        columns[name] = values if values.ndim == 1 else values[:, :_WAYS]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
+        np.savez(part, **columns)
+
+
+def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> list[AgentTrack]:
+    with np.load(path) as kept:
+        data = dict(kept)
+    tracker = PatchObserver(estimator)
+    stops = np.cumsum(data["lengths"])
+    found = []
+    for k, scenario in enumerate(group):
+        part = slice(stops[k] - data["lengths"][k], stops[k])
+        camera = Camera(*data["camera"][k, :4], *(int(x) for x in data["camera"][k, 4:]))
+        T_arena_camera = SE3(data["camera_turn"][k], data["camera_shift"][k])
+        found.append(
+            AgentTrack(
+                Observations(estimator.skeleton, *(data[name][part] for name in COLUMNS)),
+                tracker.subject(camera, T_arena_camera, float(data["sizes"][k])),
+                data["words"][part],
+                str(data["animals"][k]),
+                data["wall_mm"][part],
+                data["truth"][part],
+                scenario.word,
+            )
+        )
+    return found
+
 
 _SEED = 6
 # lower frame rates at which some of the generated training recordings are repeated
@@ -57,17 +385,17 @@ def learning_set(
     Raises:
         LiexError: no actions are generated for this animal.
     """
-    from .agent_tracks import acted, acted_tracks
-
     if animal not in WORDS:
         raise LiexError(
             f"actions are generated for {' and '.join(WORDS)}, not for {animal}; name labelled "
             "sessions"
         )
     recordings = acted(training_recordings(animal), estimator, progress)
-    usual = by_usual_camera(recordings)
     slower = [
-        one.tracked(rate) for rate in _SLOWER_HZ if rate < RATE_HZ[animal] for one in usual[::3]
+        one.tracked(rate)
+        for rate in _SLOWER_HZ
+        if rate < RATE_HZ[animal]
+        for one in recordings[:N_USUAL:3]
     ]
     cuts = (
         acted_tracks(cut_sequences(animal, False), estimator, progress) if animal == "fish" else []
@@ -102,26 +430,25 @@ def train_actions(
     Raises:
         LiexError: the animal has no generated actions, or labels and sessions do not fit.
     """
-    from liex_lab.actions.learning import learn, leave_one_animal_out, with_card
-    from liex_lab.actions.storage import save_action_model
-    from liex_lab.actions.vocabulary import DEFINITIONS
-
     if sessions:
         tracks = labelled_sessions(sessions, labels)
-        report = leave_one_animal_out(tracks, seed=_SEED, progress=progress)
-        model = learn(tracks, seed=_SEED, progress=progress)
-        model = with_card(
+        report = learning.leave_one_animal_out(tracks, seed=_SEED, progress=progress)
+        model = learning.learn(tracks, seed=_SEED, progress=progress)
+        model = learning.with_card(
             model, made_by="liex train actions", labels="people's", n_recordings=len(tracks)
         )
-        return save_action_model(model, out), report
-    from .pose_model import estimator_of
+        return storage.save_action_model(model, out), report
 
     estimator = estimator_of(animal, "default", progress, pose_model)
     tracks, cuts = learning_set(animal, estimator, progress)
-    model = learn(
-        tracks, seed=_SEED, definitions=DEFINITIONS.get(animal), sequences=cuts, progress=progress
+    model = learning.learn(
+        tracks,
+        seed=_SEED,
+        definitions=vocabulary.DEFINITIONS.get(animal),
+        sequences=cuts,
+        progress=progress,
     )
-    model = with_card(
+    model = learning.with_card(
         model,
         made_by="liex train actions",
         labels="those of generated recordings; no recording of an animal was used",
@@ -129,7 +456,7 @@ def train_actions(
         n_sequences=len(cuts),
         pose_model=estimator.model.digest(),
     )
-    return save_action_model(model, out), {}
+    return storage.save_action_model(model, out), {}
 
 
 def labelled_sessions(
@@ -148,12 +475,6 @@ def labelled_sessions(
     Raises:
         LiexError: the labels do not name a session, or a session has no label at all.
     """
-    import pandas as pd
-
-    from liex_lab.actions.ethogram import UNLABELLED
-    from liex_lab.actions.labels import LabelledTrack, sessions_named, words_of
-    from liex_lab.sessions import Session
-
     table = pd.concat([read_any_labels(path) for path in labels]) if labels else None
     tracks = []
     for path in sessions:
@@ -192,9 +513,6 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
     Raises:
         LiexError: there is no such file.
     """
-    from liex_lab.actions.labels import read_labels
-    from liex_lab.exchange.boris import boris_export_labels, boris_labels, is_boris_export
-
     source = Path(path)
     if not source.is_file():
         raise LiexError(f"there is no file of labels {source}; check the path")
@@ -226,40 +544,24 @@ def suggest(
     Raises:
         LiexError: the model is of another animal.
     """
-    import pandas as pd
-
-    from liex_lab.actions.learning import doubtful_segments
-
-    opened, recogniser = _session_and_model(session, model)
-    track = track_of(opened)
-    found = recogniser.recognise(track, wall_of(opened))
-    rows = doubtful_segments(found, track.times_ns, n, least_s)
-    return pd.DataFrame(rows, columns=["start_s", "stop_s", "guess", "or_else", "uncertainty"])
-
-
-def _session_and_model(
-    session: str | Path, model: str | Path | None
-) -> tuple[Session, TimelineModel]:
-    from liex_lab.actions.storage import load_action_model
-    from liex_lab.sessions import Session
-
     opened = Session.open(session)
     skeleton = str(opened.metadata["animal"]["name"])
-    recogniser = load_action_model(model or skeleton)
+    recogniser = storage.load_action_model(model or skeleton)
     if recogniser.skeleton != skeleton:
         raise LiexError(
             f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use "
             "another"
         )
-    return opened, recogniser
+    track = track_of(opened)
+    found = recogniser.recognise(track, wall_of(opened))
+    rows = learning.doubtful_segments(found, track.times_ns, n, least_s)
+    return pd.DataFrame(rows, columns=["start_s", "stop_s", "guess", "or_else", "uncertainty"])
 
 
 # Training and test splits of generated behaviour for action recognition.
 
 
-Recorded = TypeVar("Recorded")
-
-WORDS = {"fish": fish.ACTIONS, "mouse": mouse.ACTIONS}
+WORDS = {"fish": fish_acts.ACTIONS, "mouse": mouse_acts.ACTIONS}
 RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
 FAST_HZ = 100.0
 # cut-out sequences, as in the paper, of 5 and 2 fish
@@ -269,6 +571,7 @@ _TRAIN_FISH = (101, 102, 103, 104, 105)
 _TEST_FISH = (106, 107)
 _TRAIN_SET = tuple(range(201, 225))
 _TEST_SET = tuple(range(301, 307))
+N_USUAL = len(_TRAIN_SET)  # the first training recordings are of the usual camera
 _FAST_SET = {"fish": tuple(range(225, 233))}
 _SECONDS = 40.0
 _FAST_SECONDS = 20.0
@@ -301,11 +604,6 @@ def training_recordings(animal: str) -> list[Scenario]:
     return usual + [
         Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())
     ]
-
-
-def by_usual_camera(recordings: Sequence[Recorded]) -> list[Recorded]:
-    """The entries of the animal's usual camera, the first 24 of `training_recordings`."""
-    return list(recordings[: len(_TRAIN_SET)])
 
 
 def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:

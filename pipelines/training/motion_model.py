@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numba
 import numpy as np
@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.evaluation.scores import Followed
 from liex_lab.geometry import SE3, so3
+from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.corruptions import Event
+from liex_lab.simulation import corruptions, simulator, tracking_sequences
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.simulation.simulator import BodySimulator, world_of
-from liex_lab.simulation.tracking_sequences import tracking_sequence
 from liex_lab.tracking.motion_model import TrackingParameters, tunings_with
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.offline import track_whole
@@ -47,10 +47,6 @@ from liex_lab.tracking.tracker import FrameTracker
 
 from ..build import build_scene, plan_of
 from .pose_model import estimator_of
-
-if TYPE_CHECKING:
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.plan import Plan
 
 Array = NDArray[np.float64]
 Knots = tuple[tuple[float, float], ...]
@@ -84,12 +80,12 @@ _CHUNK = 32
 
 
 @dataclass(frozen=True)
-class Seen:
+class Measured:
     """A measured rendered sequence: observations, subject and truth.
 
     Attributes:
         kind: `easy`, `hard` or `other`.
-        seen: hypotheses of all n frames, arena frame.
+        observations: hypotheses of all n frames, arena frame.
         subject: the animal and its camera.
         pose: (n) true poses, in the same arena frame.
         truth: (n, J, 3) true joints, mm, in the same arena frame.
@@ -99,11 +95,11 @@ class Seen:
     """
 
     kind: str
-    seen: Observations
+    observations: Observations
     subject: Subject
     pose: Pose
     truth: Array
-    events: Sequence[Event]
+    events: Sequence[corruptions.Event]
     blur: float
     size_spread: float
 
@@ -164,7 +160,7 @@ def train_tracking(
 
 def measure(
     animal: str, kind: str, seed: int, n_frames: int | None, progress: Progress = silent
-) -> Seen:
+) -> Measured:
     """Measure one rendered sequence frame by frame; background and size are estimated as in a run.
 
     Args:
@@ -177,8 +173,8 @@ def measure(
     Returns:
         Observations and truth in the estimated arena frame.
     """
-    recording = tracking_sequence(
-        world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
+    recording = tracking_sequences.tracking_sequence(
+        simulator.world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
     )
     estimator = estimator_of(animal, "default", progress)
     return observed(estimator, plan_of(animal), kind, recording, recording.events, progress)
@@ -186,7 +182,7 @@ def measure(
 
 def other_builds(
     animal: str, progress: Progress = silent, seeds: Sequence[int] = BUILD_SEEDS
-) -> list[Seen]:
+) -> list[Measured]:
     """Recordings of animals of builds that no forest was trained on, measured frame by frame.
 
     Args:
@@ -197,8 +193,8 @@ def other_builds(
     Returns:
         One per seed; [] if the animal's simulator has one build only, like the hand's.
     """
-    world = world_of(Skeleton.load(animal))
-    if not isinstance(world, BodySimulator):
+    world = simulator.world_of(Skeleton.load(animal))
+    if not isinstance(world, simulator.BodySimulator):
         return []
     estimator = estimator_of(animal, "default", progress)
     plan = plan_of(animal)
@@ -211,15 +207,15 @@ def observed(
     plan: Plan,
     kind: str,
     recording: TrueRecording,
-    events: Sequence[Event] = (),
+    events: Sequence[corruptions.Event] = (),
     progress: Progress = silent,
-) -> Seen:
+) -> Measured:
     """Measure a rendered recording frame by frame; background and size are estimated as in a run.
 
     Args:
         estimator: the animal's.
         plan: thresholds of the foreground, and expected sizes.
-        kind: label of the recording, see `Seen`.
+        kind: label of the recording, see `Measured`.
         recording: with its truth.
         events: events of the recording.
         progress: called frame by frame.
@@ -237,7 +233,7 @@ def observed(
         parts.append(tracker.observe(frames))
     T = scene.floor.T_arena_camera @ recording.T_arena_camera.inverse()
     pose = recording.pose.moved(scene.floor.T_arena_camera)
-    return Seen(
+    return Measured(
         kind,
         Observations.join(parts),
         tracker.subject,
@@ -250,7 +246,7 @@ def observed(
 
 
 def search(
-    measured: Sequence[Seen],
+    measured: Sequence[Measured],
     tuning: TrackingParameters,
     n_tries: int,
     rng: np.random.Generator,
@@ -315,22 +311,28 @@ def _scaled(value: Any, factor: float, rng: np.random.Generator) -> Any:
     return replace(value, **{name: getattr(value, name) * factor})
 
 
-def _of_kind(measured: Sequence[Seen], kind: str, tuning: TrackingParameters | None) -> Array:
+def _of_kind(measured: Sequence[Measured], kind: str, tuning: TrackingParameters | None) -> Array:
     """Errors over all sequences of a kind, of single frames if `tuning` is None."""
-    found = []
-    for each in measured:
-        if each.kind == kind:
-            alone = tuning is None
-            track = single_frames(each.subject, each.seen) if alone else _track(each, tuning)
-            found.append(each.errors(track.joints_mm))
-    return np.concatenate(found)
+    return np.concatenate(
+        [
+            each.errors(
+                single_frames(each.subject, each.observations).joints_mm
+                if tuning is None
+                else _track(each, tuning).joints_mm
+            )
+            for each in measured
+            if each.kind == kind
+        ]
+    )
 
 
-def _track(each: Seen, tuning: TrackingParameters | None) -> Track:
-    return track_whole(each.subject, each.seen, (), tuning).track
+def _track(each: Measured, tuning: TrackingParameters | None) -> Track:
+    return track_whole(each.subject, each.observations, (), tuning).track
 
 
-def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: TrackingParameters) -> float:
+def _cost(
+    measured: Sequence[Measured], alone: dict[str, Array], tuning: TrackingParameters
+) -> float:
     """Cost of a tuning: its errors over those of single frames, in four statistics.
 
     It is the sum of the ratios of mean, median, 75 % and 95 % quantile; easy sequences have a
@@ -338,8 +340,7 @@ def _cost(measured: Sequence[Seen], alone: dict[str, Array], tuning: TrackingPar
     """
     total = 0.0
     for kind, weight in (("easy", _EASY_WEIGHT), ("hard", 1.0)):
-        error = _of_kind(measured, kind, tuning)
-        others = alone[kind]
+        error, others = _of_kind(measured, kind, tuning), alone[kind]
         of = [error.mean() / others.mean()]
         of += [float(np.quantile(error, q) / np.quantile(others, q)) for q in (0.5, 0.75, 0.95)]
         total += weight * float(np.sum(of))
@@ -356,9 +357,9 @@ class _Claim:
     """Stated and true errors of a sequence's frames that have a pose, over the animal's length.
 
     Attributes:
-        blur: see `Seen`.
-        size_spread: see `Seen`.
-        said: (n,) stated mean joint error.
+        blur: see `Measured`.
+        size_spread: see `Measured`.
+        stated: (n,) stated mean joint error.
         sd: (n, J) stated standard deviation of each joint.
         away: (n, J) standard deviation that a stretch of 1 gives each joint, see `stretch_of`.
         deviation: (n, J, 3) absolute errors of the joints.
@@ -366,7 +367,7 @@ class _Claim:
 
     blur: float
     size_spread: float
-    said: Array
+    stated: Array
     sd: Array
     away: Array
     deviation: Array
@@ -383,13 +384,15 @@ class _Claim:
             stretch: coefficients of blur and of size spread.
         """
         factor = np.interp(
-            np.log(self.said), *np.array([(np.log(said), factor) for said, factor in knots]).T
+            np.log(self.stated), *np.array([(np.log(stated), factor) for stated, factor in knots]).T
         )
         sd = np.hypot(factor[:, None] * self.sd, self.stretch_sd(*stretch) * self.away)
         return np.asarray(self.deviation / sd[..., None])
 
 
-def calibrate_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
+def calibrate_joints(
+    measured: Sequence[Measured], tuning: TrackingParameters
+) -> TrackingParameters:
     """The tuning with factors and stretch for which the joints' 90 % intervals cover 90 %.
 
     Over a grid of both stretch coefficients (`_PER_BLUR` x `_PER_SPREAD`) the factors are fitted to
@@ -425,7 +428,7 @@ def calibrate_joints(measured: Sequence[Seen], tuning: TrackingParameters) -> Tr
     )
 
 
-def _claim(each: Seen, plain: TrackingParameters) -> _Claim:
+def _claim(each: Measured, plain: TrackingParameters) -> _Claim:
     """Stated and true errors of a sequence tracked with factors of 1 and no stretch."""
     length = each.subject.length_mm
     track = _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain)
@@ -441,7 +444,7 @@ def _claim(each: Seen, plain: TrackingParameters) -> _Claim:
     )
 
 
-def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
+def calibrate_builds(builds: Sequence[Measured], tuning: TrackingParameters) -> TrackingParameters:
     """The tuning with the unobservable part of a build, `unseen_height` and `unseen_shift`.
 
     A joint whose error e, upwards or along the body, is more than 1.645 sd needs an additional
@@ -471,7 +474,7 @@ def calibrate_builds(builds: Sequence[Seen], tuning: TrackingParameters) -> Trac
 
 
 def calibrate_each_joint(
-    measured: Sequence[Seen], tuning: TrackingParameters
+    measured: Sequence[Measured], tuning: TrackingParameters
 ) -> TrackingParameters:
     """The tuning with a factor (`joint_calibration`) for joints whose 90 % intervals are far off.
 
@@ -513,13 +516,13 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
     Returns:
         (median stated error over the length, factor) for each group, in rising order.
     """
-    said, sd, deviation = (
+    stated, sd, deviation = (
         np.concatenate([getattr(claim, name) for claim in claims])
-        for name in ("said", "sd", "deviation")
+        for name in ("stated", "sd", "deviation")
     )
     away = np.concatenate([claim.stretch_sd(*stretch) * claim.away for claim in claims])
     knots = []
-    for rows in np.array_split(np.argsort(said, kind="stable"), min(_BINS, len(said))):
+    for rows in np.array_split(np.argsort(stated, kind="stable"), min(_BINS, len(stated))):
 
         def too_wide(factor: float, rows: NDArray[np.int64] = rows) -> bool:
             inside = deviation[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
@@ -531,11 +534,11 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
         while most > 1.001 * least:
             factor = float(np.sqrt(least * most))
             least, most = (least, factor) if too_wide(factor) else (factor, most)
-        knots.append((round(float(np.median(said[rows])), 5), round(float(most), 3)))
+        knots.append((round(float(np.median(stated[rows])), 5), round(float(most), 3)))
     return tuple(knots)
 
 
-def calibrate_roots(measured: Sequence[Seen], tuning: TrackingParameters) -> TrackingParameters:
+def calibrate_roots(measured: Sequence[Measured], tuning: TrackingParameters) -> TrackingParameters:
     """The tuning with factors for which the 90 % intervals of root and bends cover 90 %.
 
     These are `root_calibration` (6,) and `bend_calibration` (3,). The root's error is the twist

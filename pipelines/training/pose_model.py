@@ -18,27 +18,45 @@ import hashlib
 import json
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.baselines import cnn, forest
+from liex_lab.baselines.baseline import Baseline
+from liex_lab.body.pose import Pose
+from liex_lab.body.skeleton import FOREGROUNDS, Skeleton
+from liex_lab.body.surface import Surface
+from liex_lab.catalog import bundled_models, find_model
+from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
+from liex_lab.estimation.cascade import ImageSet, Truth
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.method import Method, method_of
+from liex_lab.estimation.model import ErrorCalibration, Model
+from liex_lab.estimation.training import (
+    ProgressCallback,
+    TrainingSet,
+    train_cascade,
+    train_metric,
+    train_pruner,
+)
+from liex_lab.geometry import SE3
+from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import serial_products
-
-if TYPE_CHECKING:
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.estimation.method import Method
-    from liex_lab.estimation.model import Model
-    from liex_lab.estimation.training import TrainingSet
-    from liex_lab.scene.height_maps import HeightMaps
-    from liex_lab.simulation.training_patches import TrainingPatches
+from liex_lab.scene.background import SPREADS
+from liex_lab.scene.hand_segmenter import HandPatches
+from liex_lab.scene.height_maps import HeightMaps, Patches, moment_columns, view_of
+from liex_lab.sessions.provenance import package_version
+from liex_lab.simulation import simulator, training_patches
 
 Array = NDArray[np.float64]
 
@@ -75,7 +93,7 @@ class Recipe:
     )
 
 
-# images of the last training by their inputs, see `shared_pictures`; None keeps none
+# images of the last training by their inputs, see `shared_images`; None keeps none
 _shared: ContextVar[list[tuple[Any, TrainingSet]] | None] = ContextVar("_shared", default=None)
 # separate random streams, so that each step can be repeated by itself
 _CALIBRATION = 1
@@ -94,7 +112,6 @@ RECIPES = {
     "default": Recipe(),
     "paper": Recipe(n_images=40_960, n_correction=0, n_calibration=4_096, sizes=((0.0, 144),)),
 }
-_AMOUNTS = ("n_images", "n_correction", "n_calibration", "degraded_share")
 _OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # sizes of a user's own animal, over its home length
 _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # recipes by animal and variant that differ from the mouse's
@@ -124,17 +141,15 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
         variant: `default` or `paper`, a key of `RECIPES`.
         skeleton: the animal's skeleton.
     """
-    from liex_lab.simulation.simulator import GenericSimulator, world_of
-
-    world = world_of(skeleton)
-    if not isinstance(world, GenericSimulator):
+    world = simulator.world_of(skeleton)
+    if not isinstance(world, simulator.GenericSimulator):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
     sizes = tuple(
         (factor * skeleton.length, world.window_px(factor * skeleton.length))
         for factor in _OWN_SIZES
     )
-    images = {name: getattr(_OWN["fish", variant], name) for name in _AMOUNTS}
-    return Recipe(**images, sizes=sizes if variant == "default" else sizes[:1])
+    sizes = sizes if variant == "default" else sizes[:1]
+    return replace(_OWN["fish", variant], seed=Recipe.seed, sizes=sizes)
 
 
 def train_model(
@@ -149,8 +164,7 @@ def train_model(
 ) -> Path:
     """Train an animal's pose model and write it with its card next to it (`.json`).
 
-    The model is written under another name and renamed once it is complete. The card states its
-    provenance, its SHA-256 and its number of bytes.
+    The card states the model's provenance, its SHA-256 and its number of bytes.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
@@ -165,11 +179,6 @@ def train_model(
     Returns:
         The path of the model.
     """
-    import numba
-
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.method import method_of
-
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     skeleton = Skeleton.load(animal)
@@ -179,17 +188,19 @@ def train_model(
             recipe, n_images=n_images, n_correction=n_images // 4, n_calibration=n_images // 4
         )
     model = make_model(skeleton, method_of(variant, skeleton), recipe, progress, draw)
-    path = Path(out)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = model.to_bytes()
-    unfinished = path.with_name(f"{path.name}.part-{os.getpid()}")
-    unfinished.write_bytes(content)
-    card = {**model.card, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
-    path.with_suffix(".json").write_text(
-        json.dumps(card, indent=1, sort_keys=True) + "\n", encoding="utf-8"
-    )
-    unfinished.replace(path)
+    content, path = model.to_bytes(), Path(out)
+    sha256 = hashlib.sha256(content).hexdigest()
+    _store(path, content, {**model.card, "sha256": sha256, "bytes": len(content)})
     return path
+
+
+def _store(path: Path, content: bytes, card: dict[str, Any]) -> None:
+    """Write a model, and its card next to it; it gets its name only once both are complete."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
+        part.write_bytes(content)
+        text = json.dumps(card, indent=1, sort_keys=True)
+        write_whole(path.with_suffix(".json"), text + "\n")
 
 
 @serial_products()
@@ -214,21 +225,16 @@ def make_model(
     Returns:
         The model with its card, in memory.
     """
-    from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
-    from liex_lab.estimation.model import ErrorCalibration, Model
-    from liex_lab.estimation.training import train_cascade, train_metric, train_pruner
-    from liex_lab.scene.height_maps import moment_columns
-    from liex_lab.simulation.simulator import world_of
-
     rng = np.random.default_rng([recipe.seed, _DRAW, draw] if draw else recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
     steps = len(skeleton.solved) * method.rounds + 2
-
-    def tell(share: float, what: str) -> None:
-        """Report that a `share` (0 to 1) of the forests is grown, and `what` is being grown."""
-        progress(round(share * (steps - 2)), steps, f"growing forests: {what}")
-
-    cascade, candidates = train_cascade(data, skeleton, method, rng, tell)
+    cascade, candidates = train_cascade(
+        data,
+        skeleton,
+        method,
+        rng,
+        lambda share, what: progress(round(share * (steps - 2)), steps, f"growing forests: {what}"),
+    )
     progress(steps - 2, steps, "growing forests: the learned metric")
     metric = train_metric(data, cascade, candidates, rng)
     pruner = train_pruner(data, cascade, candidates, rng)
@@ -239,7 +245,7 @@ def make_model(
         "variant": method.variant,
         "made_by": "liex train",
         "recipe": vars(recipe),
-        "images": world_of(skeleton).sources,
+        "images": simulator.world_of(skeleton).sources,
         **({"draw": draw} if draw else {}),
     }
     model = Model(
@@ -260,11 +266,8 @@ def make_model(
     if method.tells_facing:
         progress(steps - 1, steps, "learning to tell head from tail")
         first = recipe.n_images + recipe.n_correction + recipe.n_calibration
-        model = with_facing(
-            model,
-            rendered_set(skeleton, method, recipe, first, recipe.n_images, silent),
-            recipe.seed,
-        )
+        unseen = rendered_set(skeleton, method, recipe, first, recipe.n_images, silent)
+        model = with_facing(model, unseen, recipe.seed)
     return model
 
 
@@ -294,49 +297,15 @@ def rendered_set(
     Returns:
         The images, animals and other objects of about their size.
     """
-    shared = _shared.get()
-    if shared is None or first:
-        return _rendered(skeleton, method, recipe, first, n, progress, family)
+    shared = _shared.get() if first == 0 else None
     # the inputs of images and labels
     key = (skeleton.table, method.camera_view, method.session_size, vars(recipe), n, family)
-    for known, data in shared:
+    for known, data in shared or ():
         if known == key:
             return data
-    data = _rendered(skeleton, method, recipe, first, n, progress, family)
-    shared[:] = [(key, data)]
-    return data
-
-
-@contextmanager
-def shared_pictures() -> Iterator[None]:
-    """A context that keeps a training's images for the next training with the same ones.
-
-    Only those of the last different training are kept, as they take a gigabyte.
-    """
-    before = _shared.set([])
-    try:
-        yield
-    finally:
-        _shared.reset(before)
-
-
-def _rendered(
-    skeleton: Skeleton,
-    method: Method,
-    recipe: Recipe,
-    first: int,
-    n: int,
-    progress: Progress,
-    family: str,
-) -> TrainingSet:
-    """See `rendered_set`."""
-    from liex_lab.estimation.training import TrainingSet
-    from liex_lab.simulation.simulator import world_of
-    from liex_lab.simulation.training_patches import BLOCK
-
-    world = world_of(skeleton)
-    blocks = -(-n // BLOCK)
-    begin = -(-first // BLOCK)
+    world = simulator.world_of(skeleton)
+    blocks = -(-n // training_patches.BLOCK)
+    begin = -(-first // training_patches.BLOCK)
     parts: list[TrainingSet] = []
     for number in range(begin, begin + blocks):
         progress(number - begin, blocks, "rendering training images")
@@ -351,15 +320,29 @@ def _rendered(
             window_px=window_px,
         )
         parts.append(cut_out(skeleton, method, windows))
-    return TrainingSet.join(parts)
+    data = TrainingSet.join(parts)
+    if shared is not None:
+        shared[:] = [(key, data)]
+    return data
+
+
+@contextmanager
+def shared_images() -> Iterator[None]:
+    """A context that keeps a training's images for the next training with the same ones.
+
+    Only those of the last different training are kept, as they take a gigabyte.
+    """
+    before = _shared.set([])
+    try:
+        yield
+    finally:
+        _shared.reset(before)
 
 
 def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: int) -> TrainingSet:
     """Held-out images for calibrating a model's predicted error.
 
-    A share of them (`_ORDINARY_SHARE`, half for the mouse) shows bodies that vary as individuals
-    do, the rest bodies as varied as in training: intervals from the latter alone would be wider
-    than most animals need.
+    A share of them (`_ORDINARY_SHARE`) shows bodies that vary as individuals do.
 
     Args:
         skeleton: the animal's skeleton.
@@ -370,8 +353,6 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
     Returns:
         The images, varied bodies first.
     """
-    from liex_lab.estimation.training import TrainingSet
-
     ordinary = round(_ORDINARY_SHARE.get(skeleton.name, 0.0) * recipe.n_calibration)
     varied = rendered_set(skeleton, method, recipe, first, recipe.n_calibration - ordinary, silent)
     if not ordinary:
@@ -382,8 +363,39 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
     )
 
 
-def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> TrainingSet:
+def cut_out(
+    skeleton: Skeleton, method: Method, windows: training_patches.TrainingPatches
+) -> TrainingSet:
     """Training images of the two largest components of the segmentation in each patch.
+
+    Args:
+        skeleton: the animal's skeleton.
+        method: the variant; whether crops follow the camera's axis, and whether the size is known.
+        windows: rendered patches with their background and truth.
+
+    Returns:
+        The images of the first components of all patches, then those of the second ones.
+    """
+    size = windows.spine_mm / skeleton.length
+    shown = size if method.session_size else np.ones(len(size))
+    crops, crop_cameras = extract(skeleton, windows, shown, method.camera_view, n_candidates=2)
+    n = len(size)
+    return TrainingSet.join(
+        [
+            with_truth(skeleton, method, windows, crops[k], crop_cameras[k])
+            for k in (slice(n), slice(n, None))
+        ]
+    )
+
+
+def extract(
+    skeleton: Skeleton,
+    windows: training_patches.TrainingPatches,
+    size: Array,
+    camera_view: bool,
+    n_candidates: int = 1,
+) -> tuple[HeightMaps, Array]:
+    """Height maps of the largest components of the segmentation in each patch, and their cameras.
 
     A hand is segmented by distance (`HandPatches`), every other animal by background subtraction
     (`Patches`) with the patch's own estimated floor and, if the sensor's noise is known, a
@@ -391,47 +403,31 @@ def cut_out(skeleton: Skeleton, method: Method, windows: TrainingPatches) -> Tra
 
     Args:
         skeleton: the animal's skeleton; its view selects the segmentation.
-        method: the variant; whether crops follow the camera's axis, and whether the size is known.
-        windows: rendered patches with their background and truth.
-
-    Returns:
-        The images of the first components of all patches, then those of the second ones.
+        windows: rendered patches (n) with their background and truth.
+        size: (n,) size over home size that the crops are scaled to.
+        camera_view: whether crops follow the camera's axis.
+        n_candidates: components of each patch; the first ones of all patches come first.
     """
-    from liex_lab.body.skeleton import FOREGROUNDS
-    from liex_lab.estimation.training import TrainingSet
-    from liex_lab.scene.background import SPREADS
-    from liex_lab.scene.hand_segmenter import HandPatches
-    from liex_lab.scene.height_maps import Patches
-
-    size = windows.spine_mm / skeleton.length
     origin = windows.origin.astype(float)
-    shown = size if method.session_size else np.ones(len(size))
     if skeleton.view.foreground == FOREGROUNDS[1]:
-        held = HandPatches(windows.depth, windows.intrinsics, origin, skeleton.view)
-        crops, crop_cameras = held.extract(shown, method.camera_view, n_candidates=2)
-    else:
-        depth, background = (
-            picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
-            for picture in (windows.depth, windows.background)
-        )
-        cut = Patches(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
-        area = home_area_mm2(skeleton) * size**2  # only ranks the blobs of a window
-        # a scene learned from a recording has an estimate of its readings' spread
-        least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
-        crops, crop_cameras = cut.extract(shown, area, least, method.camera_view, n_candidates=2)
-    n = len(size)
-    return TrainingSet.join(
-        [
-            with_truth(skeleton, method, windows, crops[thing], crop_cameras[thing])
-            for thing in (slice(n), slice(n, None))
-        ]
+        hands = HandPatches(windows.depth, windows.intrinsics, origin, skeleton.view)
+        return hands.extract(size, camera_view, n_candidates=n_candidates)
+    depth, background = (
+        image if windows.unit_mm == 1.0 else image * np.float32(windows.unit_mm)
+        for image in (windows.depth, windows.background)
     )
+    cut = Patches(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
+    # only ranks the blobs of a window
+    area_mm2 = home_area_mm2(skeleton) * (windows.spine_mm / skeleton.length) ** 2
+    # a scene learned from a recording has an estimate of its readings' spread
+    least_mm = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
+    return cut.extract(size, area_mm2, least_mm, camera_view, n_candidates=n_candidates)
 
 
 def with_truth(
     skeleton: Skeleton,
     method: Method,
-    windows: TrainingPatches,
+    windows: training_patches.TrainingPatches,
     crops: HeightMaps,
     crop_cameras: Array,
 ) -> TrainingSet:
@@ -452,12 +448,6 @@ def with_truth(
     Returns:
         The remaining images, poses in their view frames, mm.
     """
-    from liex_lab.body.pose import Pose
-    from liex_lab.estimation.cascade import ImageSet, Truth
-    from liex_lab.estimation.training import TrainingSet
-    from liex_lab.geometry import SE3
-    from liex_lab.scene.height_maps import view_of
-
     T_view_camera = view_of(crop_cameras)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
     frames = pose.frames(skeleton)
@@ -491,13 +481,11 @@ def home_area_mm2(skeleton: Skeleton) -> float:
 
     A fixed value for the mouse, else the area of the skeleton's surface in the home pose.
     """
-    from liex_lab.body.surface import Surface
-
     return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
 
 
-def cached_model(animal: str, variant: str, progress: Progress = silent, draw: int = 0) -> Path:
-    """The path of a model that is not bundled: trained once, kept in the user's cache folder.
+def cache_path(animal: str, variant: str, draw: int = 0) -> Path:
+    """The path in the cache of a model that is not bundled, trained or not.
 
     Its name contains a hash of the program's version, method, recipe and skeleton; if one of these
     changes, a new model is trained.
@@ -505,43 +493,20 @@ def cached_model(animal: str, variant: str, progress: Progress = silent, draw: i
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         variant: `default` or `paper`.
-        progress: called with the progress of a training.
-        draw: number of the draw, see `make_model`.
-
-    Returns:
-        The path of the model (.npz).
-    """
-    path = cache_path(animal, variant, draw)
-    if path.is_file():
-        return path
-    return train_model(animal, variant, path, draw=draw, progress=progress)
-
-
-def cache_path(animal: str, variant: str, draw: int = 0) -> Path:
-    """The path in the cache of a model that is not bundled, trained or not.
-
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML.
-        variant: `default` or `paper`.
         draw: number of the draw, see `make_model`.
     """
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.method import method_of
-    from liex_lab.sessions.provenance import package_version
-
     skeleton = Skeleton.load(animal)
-    method = method_of(variant, skeleton)
-    recipe = recipe_of(variant, skeleton)
-    made_from: dict[str, Any] = {
-        "method": method.to_dict(),
-        "recipe": vars(recipe),
+    made_from = {
+        "method": method_of(variant, skeleton).to_dict(),
+        "recipe": vars(recipe_of(variant, skeleton)),
         "skeleton": skeleton.table,
     }
-    key = hashlib.sha256(
-        json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()
-    ).hexdigest()[:12]
-    number = f"-{draw}" if draw else ""
-    return cache_folder() / f"{skeleton.name}-{variant}-{key}{number}.npz"
+    return _cached(f"{skeleton.name}-{variant}", made_from, f"-{draw}" if draw else "")
+
+
+def _cached(name: str, made_from: dict[str, Any], number: str = "") -> Path:
+    made = json.dumps([package_version("liex_lab"), made_from], sort_keys=True).encode()
+    return cache_folder() / f"{name}-{hashlib.sha256(made).hexdigest()[:12]}{number}.npz"
 
 
 def cache_folder() -> Path:
@@ -575,10 +540,138 @@ def estimator_of(
     Raises:
         ModelError: there is no such model, or its file is damaged.
     """
-    from liex_lab.catalog import bundled_models, find_model
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.estimation.model import Model
-
     if model is not None or (variant == "default" and animal in bundled_models()):
         return PoseEstimator(Model.load(find_model(model or animal)))
-    return PoseEstimator(Model.load(cached_model(animal, variant, progress, draw)))
+    path = cache_path(animal, variant, draw)
+    if not path.is_file():
+        train_model(animal, variant, path, draw=draw, progress=progress)
+    return PoseEstimator(Model.load(path))
+
+
+# Training of the paper's baselines RF and CNN (Lie-X section 5.2), kept in the user's cache.
+
+
+@dataclass(frozen=True)
+class Training:
+    """Training images and parameters of a baseline.
+
+    Attributes:
+        recipe: the rendered images.
+        plan: parameters of the forests or of the network.
+    """
+
+    recipe: Recipe
+    plan: forest.ForestPlan | cnn.CnnPlan
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values of the training, a cache key: equal values mean equal training."""
+        return {"recipe": vars(self.recipe), "plan": asdict(self.plan)}
+
+
+BASELINES: dict[str, forest.ForestPlan | cnn.CnnPlan] = {
+    "rf": forest.ForestPlan(),
+    "cnn": cnn.CnnPlan(),
+}
+_SEEN = 122_880  # total views of the CNN, whatever the number of images
+
+
+def training_of(variant: str, skeleton: Skeleton) -> Training:
+    """The training of a baseline, on the images of the paper's variant.
+
+    They are the same in number, noise and sizes (40,960 for the mouse, 20,480 for the hand, 16,384
+    for others, half of them degraded); the CNN gets about 122,880 views in total, over as many
+    epochs as needed.
+
+    Args:
+        variant: `rf` or `cnn`, a key of `BASELINES`.
+        skeleton: the animal's skeleton.
+    """
+    recipe = replace(recipe_of("paper", skeleton), n_calibration=0)
+    plan = BASELINES[variant]
+    if isinstance(plan, cnn.CnnPlan):
+        plan = replace(plan, epochs=round(_SEEN / recipe.n_images))
+    else:
+        plan = replace(plan, home_turn=method_of("paper", skeleton).home_turn)
+    return Training(recipe, plan)
+
+
+def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> Baseline:
+    """The baseline of an animal, from the cache or trained now.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        variant: `rf` or `cnn`.
+        progress: called with the progress of the training.
+
+    Raises:
+        MissingPackageError: the variant is `cnn` and torch is not installed.
+    """
+    if variant == "cnn":
+        cnn.require_torch()  # before anything is rendered
+    skeleton = Skeleton.load(animal)
+    training = training_of(variant, skeleton)
+    path = cached_baseline(variant, skeleton, training)
+    if not path.is_file():
+        train_baseline(variant, skeleton, training, path, progress)
+    if isinstance(training.plan, cnn.CnnPlan):
+        return cnn.Cnn.load(path, skeleton, training.plan)
+    return forest.RegressionForest.load(path, skeleton, training.plan)
+
+
+def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Path:
+    """The path of a baseline in the cache (.npz), with its card next to it (.json).
+
+    Args:
+        variant: `rf` or `cnn`.
+        skeleton: the animal's skeleton.
+        training: its images and parameters; their hash with the program's version is in the name.
+    """
+    return _cached(f"{skeleton.name}-{variant}", training.to_dict())
+
+
+def train_baseline(
+    variant: str, skeleton: Skeleton, training: Training, path: Path, progress: Progress
+) -> None:
+    """Train a baseline and write it with its card; it gets its name only once it is complete.
+
+    Args:
+        variant: `rf` or `cnn`.
+        skeleton: the animal's skeleton.
+        training: images and parameters.
+        path: where the model is written (.npz); the card is next to it (.json).
+        progress: called with the progress of rendering and training.
+    """
+    # the paper's view of an animal of unknown size
+    method = replace(method_of("paper", skeleton), session_size=False)
+    recipe = training.recipe
+    data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
+    began = time.perf_counter()
+    model = fit(
+        training,
+        data,
+        skeleton,
+        lambda share, what: progress(round(100 * share), 100, f"training {what}"),
+    )
+    card = {
+        "animal": skeleton.name,
+        "variant": variant,
+        **training.to_dict(),
+        "n_images": len(data.size),
+        "training_s": round(time.perf_counter() - began, 1),
+        "cores": numba.get_num_threads(),
+    }
+    _store(path, model.to_bytes(), card)
+
+
+def fit(
+    training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback
+) -> forest.RegressionForest | cnn.Cnn:
+    """Train a baseline on rendered images.
+
+    Raises:
+        MissingPackageError: the plan is of the CNN and torch is not installed.
+    """
+    rng = np.random.default_rng(training.recipe.seed)
+    if isinstance(training.plan, cnn.CnnPlan):
+        return cnn.train_cnn(data, skeleton, training.plan, rng, tell)
+    return forest.train_forests(data, skeleton, training.plan, rng, tell)

@@ -10,29 +10,27 @@ is deterministic.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.errors import LiexError
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.session_shape import PLACES, ShapePrior, labels_of, session_clues
+from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import serial_products
+from liex_lab.scene.height_maps import HeightMaps, view_of
+from liex_lab.simulation import simulator, training_patches
 
-from ..evaluation.pose import estimator_of
-from .pose_model import home_area_mm2, recipe_of
-
-if TYPE_CHECKING:
-    from liex_lab.body.shape import BodyShape
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.estimation.session_shape import ShapePrior
-    from liex_lab.scene.height_maps import HeightMaps
-    from liex_lab.simulation.training_patches import TrainingPatches
+from .pose_model import estimator_of, extract, recipe_of
 
 Array = NDArray[np.float64]
 
@@ -46,17 +44,7 @@ _LEAST_GOOD = 8  # frames per mini-session
 _FAR = 0.12  # of the length: a pose with a larger error is lost, and not an error of the build
 
 
-@dataclass(frozen=True)
-class MiniSession:
-    """Features of a rendered mini-session, and its truth.
-
-    Attributes:
-        clues: (F,) see `session_clues`.
-        labels: (K,) see `ShapePrior`.
-    """
-
-    clues: Array
-    labels: Array
+MiniSession = tuple[Array, Array]  # clues (F,), see `session_clues`; labels (K,), see `ShapePrior`
 
 
 @serial_products()
@@ -83,23 +71,16 @@ def train_shape(
     Raises:
         LiexError: the animal is not a chain with a tube as its body.
     """
-    import numba
-
-    from liex_lab.estimation.session_shape import ShapePrior
-
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     estimator = estimator_of(animal, "default", progress)
     known = n_sessions or N_SESSIONS
     rows = list(mini_sessions(estimator, "wide", known, progress))
-    prior = ShapePrior.fit(
-        np.stack([row.clues for row in rows]), np.stack([row.labels for row in rows])
-    )
+    prior = ShapePrior.fit(*(np.stack(part) for part in zip(*rows, strict=True)))
     others = list(mini_sessions(estimator, "other", known // 4, progress))
     prior = replace(prior, unseen=left_over(prior, others), model=estimator.model.fingerprint)
-    unfinished = out.with_name(f"{out.name}.part-{os.getpid()}.npz")
-    np.savez(unfinished, **prior.arrays())  # type: ignore[arg-type]
-    unfinished.replace(out)
+    with replacing(out) as part:
+        np.savez(part, **prior.arrays())  # type: ignore[arg-type]
     return out
 
 
@@ -109,15 +90,10 @@ def left_over(prior: ShapePrior, others: Sequence[MiniSession]) -> tuple[float, 
     Returns:
         Standard deviations over the length, of all joints together.
     """
-    from liex_lab.estimation.session_shape import PLACES
-
-    n = len(others[0].labels) - 2 * len(PLACES)
-    left = np.stack([one.labels - prior.predict(one.clues) for one in others])[:, :n]
-    left = left.reshape(len(others), -1, 3)
-    return (
-        round(float(np.sqrt(np.mean(left[..., 2] ** 2))), 4),
-        round(float(np.sqrt(np.mean(left[..., 0] ** 2))), 4),
-    )
+    left = np.stack([labels - prior.predict(clues) for clues, labels in others])
+    joints = left[:, : -2 * len(PLACES)].reshape(len(others), -1, 3)
+    height, along = (round(float(np.sqrt(np.mean(joints[..., k] ** 2))), 4) for k in (2, 0))
+    return height, along
 
 
 def mini_sessions(
@@ -134,20 +110,16 @@ def mini_sessions(
     Raises:
         LiexError: the animal is not a chain with a tube as its body.
     """
-    from liex_lab.body.shape import BodyShape
-    from liex_lab.simulation.simulator import BodySimulator, world_of
-    from liex_lab.simulation.training_patches import BLOCK, drawn_bodies
-
     skeleton = estimator.skeleton
-    world = world_of(skeleton)
-    if not isinstance(world, BodySimulator) or "stations" not in skeleton.surface:
+    world = simulator.world_of(skeleton)
+    if not isinstance(world, simulator.BodySimulator) or "stations" not in skeleton.surface:
         raise LiexError(
             f"a shape is learned of animals that are one chain with a tube around it, not of "
             f"'{skeleton.name}'"
         )
     recipe = recipe_of("default", skeleton)
     seed = SEEDS[family]
-    n_blocks = -(-n * PER_SESSION // BLOCK)
+    n_blocks = -(-n * PER_SESSION // training_patches.BLOCK)
     for number in range(n_blocks):
         progress(number, n_blocks, f"rendering animals of the family '{family}'")
         spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
@@ -158,56 +130,33 @@ def mini_sessions(
             "per_session": PER_SESSION,
         }
         (windows,) = world.training_blocks(seed, 1, first=number, window_px=window_px, **drawn)
-        bodies = drawn_bodies(seed, number, world.species, **drawn)
+        bodies = training_patches.drawn_bodies(seed, number, world.species, **drawn)
         assert isinstance(bodies, BodyShape)
         yield from _measured(estimator, windows, bodies, np.random.default_rng([seed, number, 2]))
 
 
 def _measured(
-    estimator: PoseEstimator, windows: TrainingPatches, bodies: BodyShape, rng: np.random.Generator
+    estimator: PoseEstimator,
+    windows: training_patches.TrainingPatches,
+    bodies: BodyShape,
+    rng: np.random.Generator,
 ) -> Iterator[MiniSession]:
     """The mini-sessions of one block."""
-    from liex_lab.body.pose import Pose
-    from liex_lab.scene.height_maps import view_of
-
     skeleton = estimator.skeleton
-    crops, crop_cameras = _cut(estimator, windows)
-    truth = Pose(view_of(crop_cameras) @ windows.root, windows.angles, windows.scale)
-    joints = truth.joints(skeleton)
+    size = windows.spine_mm / skeleton.length
+    camera_view = estimator.model.method.camera_view
+    crops, crop_cameras = extract(skeleton, windows, size, camera_view)
+    pose = Pose(view_of(crop_cameras) @ windows.root, windows.angles, windows.scale)
+    joints = pose.joints(skeleton)
     for k in range(len(bodies)):
         rows = np.arange(k * PER_SESSION, (k + 1) * PER_SESSION)
-        size = windows.spine_mm[rows[0]] / skeleton.length
-        begin = float(size * np.exp(_SIZE_SD * rng.standard_normal()))
+        true = float(size[rows[0]])
+        begin = float(true * np.exp(_SIZE_SD * rng.standard_normal()))
         found = _mini_session(
-            estimator, crops[rows], crop_cameras[rows], joints[rows], bodies[k], size, begin
+            estimator, crops[rows], crop_cameras[rows], joints[rows], bodies[k], true, begin
         )
         if found is not None:
             yield found
-
-
-def _cut(estimator: PoseEstimator, windows: TrainingPatches) -> tuple[HeightMaps, Array]:
-    """Height maps of the animals in patches, segmented as in a run."""
-    from liex_lab.scene.background import SPREADS
-    from liex_lab.scene.height_maps import Patches
-
-    skeleton = estimator.skeleton
-    size = windows.spine_mm / skeleton.length
-    depth, background = (
-        picture if windows.unit_mm == 1.0 else picture * np.float32(windows.unit_mm)
-        for picture in (windows.depth, windows.background)
-    )
-    cut = Patches(
-        depth,
-        background,
-        windows.intrinsics,
-        windows.origin.astype(float),
-        windows.floor,
-        skeleton.view,
-    )
-    least = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
-    return cut.extract(
-        size, home_area_mm2(skeleton) * size**2, least, estimator.model.method.camera_view
-    )
 
 
 def _mini_session(
@@ -223,9 +172,6 @@ def _mini_session(
 
     truth (n, J, 3) mm are its true joints in the view frames.
     """
-    from liex_lab.estimation.session_shape import session_clues
-    from liex_lab.scene.height_maps import view_of
-
     skeleton = estimator.skeleton
     plain = replace(estimator, model=replace(estimator.model, corrector=None))
     size = begin
@@ -233,8 +179,8 @@ def _mini_session(
         estimates = plain.best_of(crops, crop_cameras, size)
         if estimates.found.sum() < _LEAST_GOOD:
             return None
-        told = float(np.median(plain.sizes_by_frame(estimates)))
-        size *= (told / size) ** _PER_PASS
+        observed = float(np.median(plain.sizes_by_frame(estimates)))
+        size *= (observed / size) ** _PER_PASS
     estimates = estimator.best_of(crops, crop_cameras, size)
     pose = estimates.chosen.pose.moved(view_of(crop_cameras))
     off = truth - pose.joints(skeleton)
@@ -245,21 +191,12 @@ def _mini_session(
     use = estimates.found
     clues = session_clues(skeleton, pose[use], crops.heights[use], crop_cameras[use], size)
     offset = np.einsum("nji,nkj->nki", pose.root.rotation[good], off[good]).mean(axis=0) / length
-    return MiniSession(clues, _labels(skeleton, offset, body, true_size / size))
-
-
-def _labels(skeleton: Skeleton, offset: Array, body: BodyShape, grown: float) -> Array:
-    """Labels of a mini-session; `grown` is the animal's true over its estimated size."""
-    from liex_lab.body.shape import BodyShape
-    from liex_lab.estimation.session_shape import PLACES, labels_of
-
-    stations = np.array(skeleton.surface["stations"], float)
-    average = BodyShape.default(skeleton)
+    average, stations = BodyShape.default(skeleton), skeleton.surface["stations"]
     width, height = (
-        grown * np.interp(PLACES, stations, own) / np.interp(PLACES, stations, usual)
+        true_size / size * np.interp(PLACES, stations, own) / np.interp(PLACES, stations, usual)
         for own, usual in (
             (body.half_width, average.half_width),
             (body.half_height, average.half_height),
         )
     )
-    return labels_of(offset, width, height)
+    return clues, labels_of(offset, width, height)

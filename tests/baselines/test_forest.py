@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from liex_lab.pipelines.training.baselines import training_of
+from liex_lab.pipelines.training.pose_model import training_of
 
 from liex_lab.baselines import _kernels as kernels
 from liex_lab.baselines import baseline

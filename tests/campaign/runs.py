@@ -29,14 +29,14 @@ _PRELOADED = [
     "liex_lab.behaviour",
     "liex_lab.sessions.mcap",
     "liex_lab.tracking.tracker",
-    "liex_lab.pipelines.evaluation.recordings",
+    "liex_lab.pipelines.evaluation.speed",
 ]
 _KINDS = {".parquet", ".csv", ".toml"}
 
 
 def long_sample(n_frames: int, broken_at: int = -1) -> Recording:
     """The bundled sample over and over, so that measuring it takes a while."""
-    from liex_lab.pipelines.evaluation.recordings import looped
+    from liex_lab.pipelines.evaluation.speed import looped
 
     with open_recording(SAMPLE) as short:
         recording = looped(short, n_frames)

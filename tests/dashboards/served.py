@@ -11,7 +11,7 @@ from typing import Any
 from liex_lab.dashboards.app.data import StudyData
 from liex_lab.dashboards.app.server import make_app, serve
 from liex_lab.pipelines.region_config import StatedRegions
-from liex_lab.pipelines.study.listing import list_sessions
+from liex_lab.pipelines.study.run import list_sessions
 
 from liex_lab.api import correct_session
 from liex_lab.sessions.corrections import Correction

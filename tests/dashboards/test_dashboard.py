@@ -25,7 +25,7 @@ from liex_lab.dashboards.app.data import GREY, NO_POSE, Ethogram, StudyData, col
 from liex_lab.dashboards.app.guard import MOST_BYTES
 from liex_lab.dashboards.app.pages import ethogram_rows, moved_to
 from liex_lab.dashboards.app.server import address, make_app, serve
-from liex_lab.pipelines.study.listing import list_sessions
+from liex_lab.pipelines.study.run import list_sessions
 from typer.testing import CliRunner
 
 from liex_lab import api, cli

@@ -11,30 +11,51 @@ from the middle of the true joints than 0.8 spines. All numbers are mm.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines.baseline import Baseline, PlainMean, chosen, second_is_likelier
+from liex_lab.baselines.baseline import (
+    Guesses,
+    PlainMean,
+    chosen,
+    second_is_likelier,
+)
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import PlanError
-from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.evaluation.scores import PoseErrors, interval95, plain
+from liex_lab.estimation.calibration import run_on
+from liex_lab.estimation.cascade import Candidates, Cascade
+from liex_lab.estimation.estimator import Estimates, PoseEstimator
+from liex_lab.estimation.initial import N_DIRECTIONS
+from liex_lab.estimation.method import Method, method_of
+from liex_lab.estimation.model import Model
+from liex_lab.estimation.training import (
+    Proposals,
+    TrainingSet,
+    joint_error,
+    start_candidates,
+    train_cascade,
+    train_metric,
+)
+from liex_lab.evaluation.scores import PoseErrors, interval95, plain, rank_correlation
 from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
+from liex_lab.scene._height_map_kernels import CropCamera
+from liex_lab.scene.height_maps import HeightMaps, Patches, Segmenter, in_camera_frame, view_of
 from liex_lab.simulation.recording import TrueRecording
 
 from ...build import build_scene, plan_of
-from ...training.pose_model import estimator_of
-from ..pose import subject_of, told_by
+from ...training.action_model import Scenario, cut_sequences, rendered, staged
+from ...training.pose_model import estimator_of, recipe_of, rendered_set
+from ..pose import Subject, subject_of, unpacked
 from ..speed import Footage, two_cores
 
 Array = NDArray[np.float64]
-Subject = PoseEstimator | Baseline
 Tests = Mapping[str, Sequence[TrueRecording]]  # by split
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
@@ -154,17 +175,16 @@ def measured(
     Returns:
         As `pose.measure`: joints (n, J, 3) mm, camera frame; predicted error (n,) mm; factors (2,).
     """
-    sized, camera_view = (
-        (subject.model.method.session_size, subject.model.method.camera_view)
-        if isinstance(subject, PoseEstimator)
-        else (subject.takes_size, True)
-    )
+    answer: Callable[..., Estimates | Guesses]
+    if isinstance(subject, PoseEstimator):
+        method, answer = subject.model.method, subject.best_of
+        sized, camera_view = method.session_size, method.camera_view
+    else:
+        sized, camera_view, answer = subject.takes_size, True, subject.guesses
     key = (view.size if sized else 1.0, camera_view)
     if key not in cut:
         cut[key] = chosen(frames, scene, key[0], view.second, camera_view)
-    if isinstance(subject, PoseEstimator):
-        return told_by(subject, subject.best_of(*cut[key], key[0]))
-    return told_by(subject, subject.guesses(*cut[key], key[0]))
+    return unpacked(subject, answer(*cut[key], key[0]))
 
 
 def measured_rows(
@@ -379,3 +399,309 @@ def _around(recording: TrueRecording, frame: int) -> dict[str, Any]:
         "spine_mm": recording.spine_mm,
         "truth": truth,
     }
+
+
+# Data of Figures 7, 13 to 16 and 19 of Lie-X: sensitivity, ranked candidates, key frames.
+
+
+SWEEP_PROTOCOL = (
+    "Mean joint error in mm at home size on unseen rendered images, half of them "
+    "degraded as in training. Every point but those of the initial poses is a model of its own, "
+    "all on the same few images, so the errors are larger than those of the tables; only their "
+    "course counts."
+)
+PROTOCOL = (
+    "Unseen rendered images, cut out by the product's foreground. The one shown is "
+    "that whose best ranked candidate has the median error of all, so it is neither the best nor "
+    "the worst."
+)
+INITIAL_POSES = "initial poses"
+_PROPOSED = (
+    "not varied: a forest proposes the initial poses of this variant, two for each of its trees"
+)
+_KEY_FRAMES = 4
+_FROM_THE_SIDE = ("surface", "dive")
+_MOST_DOTS = 1_500  # of a body
+_WINDOW_PX = 128
+_ABOVE_GROUND_MM = 4.0  # a pixel less far above the empty ground is noise
+_NEAR = 0.25  # of the body's length: points farther from every joint are noise
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The budget of a sweep, and the values to try in addition to the method's own.
+
+    Attributes:
+        n_images: images that each model is trained on.
+        n_test: images that it is tested on.
+        values: (name of the parameter, values) for each of the five.
+    """
+
+    n_images: int = 2_048
+    n_test: int = 1_024
+    values: tuple[tuple[str, tuple[int, ...]], ...] = (
+        (INITIAL_POSES, (1, 2, 5, 10, 20, 40, 80)),
+        ("rounds", (1, 2, 3, 5, 7)),
+        ("trees", (1, 3, 6, 10, 20)),
+        ("tree depth", (6, 10, 14, 18, 24)),
+        ("metric trees", (2, 5, 10, 20, 40, 80)),
+    )
+
+
+_VARIED = {  # the five parameters, as attributes of a method or of a part of it
+    INITIAL_POSES: ("n_candidates",),
+    "rounds": ("rounds",),
+    "trees": ("regressors", "n_trees"),
+    "tree depth": ("regressors", "max_depth"),
+    "metric trees": ("metric", "n_trees"),
+}
+
+
+def chosen_values(method: Method) -> dict[str, int]:
+    """The method's own value of each of the five parameters."""
+    return {name: reduce(getattr, path, method) for name, path in _VARIED.items()}
+
+
+def with_value(method: Method, number: str, value: int) -> Method:
+    """The method with one of the five parameters changed."""
+    *part, name = _VARIED[number]
+    changed: dict[str, Any] = {name: value}
+    if number == INITIAL_POSES:
+        changed["top_k"] = min(value, method.top_k)
+    for whole in part:
+        changed = {whole: replace(getattr(method, whole), **changed)}
+    return replace(method, **changed)
+
+
+def sensitivity(
+    skeleton: Skeleton, variant: str, sweep: Sweep, progress: Progress = silent
+) -> dict[str, Any]:
+    """Curves of a variant: mean and median error, mm, over the values of each parameter.
+
+    Args:
+        skeleton: the animal's skeleton.
+        variant: `paper` or `default`.
+        sweep: images and values.
+        progress: called point by point.
+
+    Returns:
+        `curves` by parameter, the method's `chosen` values, the parameters `left_out` with the
+        reason, amounts, seed and protocol.
+    """
+    method = method_of(variant, skeleton)
+    recipe = _near_home_size(skeleton)
+    data = rendered_set(skeleton, method, recipe, 0, sweep.n_images, silent)
+    test = rendered_set(skeleton, method, recipe, sweep.n_images, sweep.n_test, silent)
+    left_out = {} if method.proposals is None else {INITIAL_POSES: _PROPOSED}
+    own = {name: n for name, n in chosen_values(method).items() if name not in left_out}
+    points = [
+        (number, value)
+        for number, values in sweep.values
+        if number in own
+        for value in sorted({*values, own[number]})
+    ]
+    curves: dict[str, list[dict[str, float]]] = {number: [] for number, _ in points}
+    base, candidates, base_metric = _train(data, skeleton, method, recipe.seed)
+    for k, (number, value) in enumerate(points):
+        progress(k, len(points), f"{skeleton.name}, {variant}: {number} {value}")
+        changed = with_value(method, number, value)
+        cascade, metric = base, base_metric
+        if number == "metric trees" and changed != method:
+            rng = np.random.default_rng(recipe.seed + 1)
+            metric = train_metric(data, replace(base, method=changed), candidates, rng)
+        elif number != INITIAL_POSES and changed != method:
+            cascade, _, metric = _train(data, skeleton, changed, recipe.seed)
+        model = Model(replace(cascade, method=changed), metric, None, {})
+        run = run_on(model, test, np.random.default_rng(recipe.seed))
+        error = run.joint_error.mean(axis=1)
+        median = float(np.median(error))
+        curves[number].append({"value": value, "mean_mm": float(error.mean()), "median_mm": median})
+    return {
+        "variant": variant,
+        "n_images": len(data.size),
+        "n_test": int(test.animal.sum()),
+        "seed": recipe.seed,
+        "chosen": own,
+        "left_out": left_out,
+        "curves": curves,
+        "protocol": SWEEP_PROTOCOL,
+    }
+
+
+def _near_home_size(skeleton: Skeleton) -> Any:
+    """The default's recipe, with animals of the sizes that the paper's variant is trained on."""
+    return replace(recipe_of("default", skeleton), sizes=recipe_of("paper", skeleton).sizes)
+
+
+def _train(
+    data: TrainingSet, skeleton: Skeleton, method: Method, seed: int
+) -> tuple[Cascade, Candidates, Any]:
+    """A small cascade, the final state of its training candidates, and its learned metric."""
+    rng = np.random.default_rng(seed)
+    cascade, candidates = train_cascade(data, skeleton, method, rng, lambda share, what: None)
+    return cascade, candidates, train_metric(data, cascade, candidates, rng)
+
+
+def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
+    """Data for the figures of candidates and convergence, for a model on unseen images.
+
+    Returns:
+        `ranked`: the example's candidates, best score first; `rank_correlation`: mean over images
+            of Spearman's correlation of score and error over an image's candidates; `steps`:
+            errors, mm at home size (the example's at its own size), after every joint and round;
+            `heights`, `true_px` and `edges` of the example; amounts and protocol.
+    """
+    skeleton, method = model.skeleton, model.method
+    data = _unseen(skeleton, model, n_images)
+    n, k = len(data.size), method.n_candidates
+    proposals = None
+    if (forest := model.cascade.proposals) is not None:
+        k = min(k, N_DIRECTIONS * forest.n_trees)
+        proposals = Proposals(forest, np.zeros((forest.n_trees, n), np.bool_))  # no tree saw them
+    method_k = replace(method, training_candidates=k)
+    candidates = start_candidates(data, skeleton, method_k, np.random.default_rng(0), proposals)
+    names, errors, positions = _follow(model.cascade, data, candidates)
+    samples = model.cascade.metric_samples(data.images, candidates)
+    scores = model.cascade.predict(model.metric, samples)[:, 0].astype(float).reshape(n, k)
+    final = errors[-1].reshape(n, k)
+    best = scores.argmin(axis=1)
+    example = int(np.argsort(final[np.arange(n), best])[n // 2])
+    rows = example * k + np.argsort(scores[example], kind="stable")
+    of_best = np.arange(n) * k + best
+    size = data.size[example] if method.session_size else 1.0
+    correlations = [rank_correlation(a, b) for a, b in zip(scores, final, strict=True)]
+    return {
+        "animal": skeleton.name,
+        "variant": method.variant,
+        "n_images": n,
+        "n_candidates": k,
+        "protocol": PROTOCOL,
+        "edges": skeleton.edges,
+        "heights": data.images.heights[example],
+        "true_px": _pixels(data.truth.positions[example][None], data, example)[0],
+        "ranked": {
+            "joints_px": _pixels(positions[-1][rows], data, example),
+            "score_mm": scores.ravel()[rows] * size,
+            "error_mm": final.ravel()[rows] * size,
+        },
+        "rank_correlation": float(np.mean(correlations)),
+        "steps": {
+            "names": names,
+            "median_mm": [float(np.median(e)) for e in errors],
+            "low_mm": [float(np.quantile(e, 0.25)) for e in errors],
+            "high_mm": [float(np.quantile(e, 0.75)) for e in errors],
+            "best_mm": [float(e[of_best].mean()) for e in errors],
+            "example_mm": [float(e[rows[0]] * size) for e in errors],
+            "joints_px": [_pixels(p[rows[:1]], data, example)[0] for p in positions],
+        },
+    }
+
+
+def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
+    """Images (n) of animals near home size, beyond those used for forests and calibration."""
+    recipe = _near_home_size(skeleton)
+    first = recipe.n_images + recipe.n_correction + recipe.n_calibration
+    data = rendered_set(skeleton, model.method, recipe, first, n, silent)
+    rows = np.flatnonzero(data.animal)[:n]
+
+    def some(part: Any) -> Any:
+        return type(part)(*(getattr(part, name)[rows] for name in type(part).__annotations__))
+
+    return TrainingSet(some(data.images), some(data.truth), data.size[rows], data.animal[rows])
+
+
+def _follow(
+    cascade: Cascade, data: TrainingSet, candidates: Candidates
+) -> tuple[list[str], list[Array], list[Array]]:
+    """Names, errors (n K,) mm at home size, and positions after each step of Algorithm 1."""
+    skeleton = cascade.skeleton
+    names: list[str] = []
+    errors: list[Array] = []
+    positions: list[Array] = []
+    left = list(range(1, skeleton.n_joints))  # joints that are not solved yet
+
+    def note(name: str) -> None:
+        for joint in left:
+            cascade.place(candidates, joint)  # straight on from its parent's current position
+        names.append(name)
+        errors.append(joint_error(candidates, data.truth))
+        positions.append(candidates.positions.copy())
+
+    note("start")
+    for joint, c in cascade.steps(data.images, candidates):
+        left = [one for one in left if one != joint]
+        note(f"{skeleton.names[joint]} {c + 1}")
+    return names, errors, positions
+
+
+def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
+    """Columns and rows (m, J, 2) of joints (m, J, 3) of one image's view in its height map."""
+    packed = data.images.crop_cameras[image]
+    camera = CropCamera(*packed)
+    joints = in_camera_frame(positions, np.repeat(packed[None], len(positions), 0))
+    x, y, z = np.moveaxis(joints, -1, 0)
+    uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
+    return (uv - [camera.u0, camera.v0]) / camera.step
+
+
+def acted_key_frames(animal: str = "fish") -> list[dict[str, Any]]:
+    """Data for Fig. 19 from the first test sequence of each action.
+
+    Returns:
+        For each action `word`; `side`, whether it is viewed from the side; `path_mm` (n, 2) of the
+        middle of the body; `bodies_mm`, for each key frame the points (m, 2) visible to the camera;
+        `skeletons_mm` (k, J, 2); `edges`; and `seconds`, its length.
+    """
+    first: dict[str, Scenario] = {}
+    for scenario in cut_sequences(animal, True):
+        first.setdefault(scenario.word, scenario)
+    return [_key_frames(scenario) for scenario in first.values()]
+
+
+def _key_frames(scenario: Scenario) -> dict[str, Any]:
+    """Generate an action, and render it at evenly spaced key frames."""
+    rng = np.random.default_rng([scenario.individual, scenario.seed])
+    stage = staged(scenario, rng)
+    motion, steps, pose, _, _, species, camera, *_ = stage
+    inside = np.flatnonzero(motion.word[steps] == scenario.word)
+    rows = np.linspace(0, len(inside) - 1, min(_KEY_FRAMES, len(inside))).round().astype(int)
+    (patches,) = rendered(rng, stage, inside[rows], _WINDOW_PX)
+    joints = pose[inside].joints(species.skeleton)
+    middle = joints.mean(axis=1)
+    side = scenario.word in _FROM_THE_SIDE
+    axes = np.eye(3)[:2]
+    if side:
+        axes = np.array([[*_direction(middle), 0.0], [0.0, 0.0, 1.0]])
+    bodies = []
+    for k, row in enumerate(rows):
+        points = _visible_points(patches, k, camera.T_arena_camera)
+        off = np.linalg.norm(points[:, None] - joints[row], axis=-1).min(axis=1)
+        body = points[off < _NEAR * species.skeleton.length]
+        bodies.append((body[:: max(1, -(-len(body) // _MOST_DOTS))] - middle[0]) @ axes.T)
+    return {
+        "word": scenario.word,
+        "side": side,
+        "path_mm": (middle - middle[0]) @ axes.T,
+        "bodies_mm": bodies,
+        "skeletons_mm": (joints[rows] - middle[0]) @ axes.T,
+        "edges": species.skeleton.edges,
+        "seconds": (len(middle) - 1) / scenario.rate_hz,
+    }
+
+
+def _visible_points(patches: Patches, k: int, T_arena_camera: SE3) -> Array:
+    """Points of patch k above the ground, (m, 3) mm, arena frame."""
+    depth = patches.depth[k].astype(float)
+    v, u = np.nonzero((depth > 0) & (patches.background[k] - depth > _ABOVE_GROUND_MM))
+    fx, fy, cx, cy = patches.intrinsics[k]
+    z = depth[v, u]
+    x = (u + patches.origin[k, 0] - cx) / fx * z
+    y = (v + patches.origin[k, 1] - cy) / fy * z
+    return np.asarray(T_arena_camera @ np.stack([x, y, z], axis=-1))
+
+
+def _direction(path: Array) -> Array:
+    """The main horizontal direction (2,) of a path (n, 3), pointing from its start to its end."""
+    off = path[:, :2] - path[:, :2].mean(axis=0)
+    axis = np.linalg.svd(off, full_matrices=False)[2][0]
+    return np.asarray(axis if (path[-1, :2] - path[0, :2]) @ axis >= 0 else -axis)

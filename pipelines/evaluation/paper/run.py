@@ -36,22 +36,22 @@ from liex_lab.sessions.provenance import package_version
 from liex_lab.simulation.recording import SEALED
 from liex_lab.simulation.simulator import world_of
 
-from ...training.action_model import cut_sequences
-from ...training.agent_tracks import acted_tracks
-from ...training.baselines import BASELINES, fit, training_of
+from ...training.action_model import acted_tracks, cut_sequences
 from ...training.pose_model import (
+    BASELINES,
     estimator_of,
+    fit,
     make_model,
     recipe_of,
     rendered_set,
-    shared_pictures,
+    shared_images,
+    training_of,
 )
 from ..actions import sequence_scores
 from ..nyu import evaluate_nyu
 from ..tracking import evaluate_tracking
-from . import illustrations, rows
-from .illustrations import Sweep
-from .rows import ROWS, SWEPT, TRAINING_DRAWS, Subject, Tests
+from . import rows
+from .rows import ROWS, SWEPT, TRAINING_DRAWS, Subject, Sweep, Tests
 
 CURVES = "fig7"  # name of the curves among the names of rows
 PARTS = ("tracking", "actions")
@@ -200,14 +200,14 @@ def _command(
     sealed: bool = False,
 ) -> str:
     """The command line that reproduces the numbers."""
-    flags = {"--quick": quick, "--fresh": fresh, "--sealed": sealed}
-    words = [
-        *("liex", "evaluate", "tables", *(f"--animal={animal}" for animal in animals)),
-        *([f"--frames={n_frames}"] if n_frames else []),
-        *(name for name, given in flags.items() if given),
-        *(f"--row={row}" for row in rows),
-    ]
-    return shlex.join(words)
+    flags = {f"--frames={n_frames}": n_frames, "--quick": quick, "--fresh": fresh}
+    return shlex.join(
+        [
+            *("liex", "evaluate", "tables", *(f"--animal={animal}" for animal in animals)),
+            *(name for name, given in {**flags, "--sealed": sealed}.items() if given),
+            *(f"--row={row}" for row in rows),
+        ]
+    )
 
 
 def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
@@ -311,7 +311,7 @@ def results_of(
     postures = world_of(skeleton).test_postures
     runs: dict[str, list[Subject]] = {}
     missing: dict[str, str] = {}
-    with shared_pictures():
+    with shared_images():
         for name in budget.fresh:
             try:
                 runs[name] = (quick_runs if budget.quick else rows.runs_of)(animal, name, progress)
@@ -338,11 +338,6 @@ def results_of(
     n_images = _QUICK_ILLUSTRATED if budget.quick else _ILLUSTRATED
     examples = {name: row["examples"] for name, row in found.items()}
     failures = {name: found[name].get("failures") for name in SWEPT[::-1] if name in found}
-    drawn = {
-        name: rows.shown_poses(some, {name: some}, tests)[name]
-        for name, some in failures.items()
-        if some
-    }
     return {
         "animal": skeleton.name,
         "joints": list(skeleton.names),
@@ -352,16 +347,19 @@ def results_of(
         "sealed": budget.sealed,
         "test_postures": postures,
         "sensitivity": curves,
-        "illustration": illustrations.illustrate(chooser.model, n_images),
+        "illustration": rows.illustrate(chooser.model, n_images),
         "examples": rows.shown_poses(examples["default"], examples, tests),
-        "failures": drawn,
+        "failures": {
+            name: rows.shown_poses(some, {name: some}, tests)[name]
+            for name, some in failures.items()
+            if some
+        },
     }
 
 
 def _tests(skeleton: Skeleton, budget: Budget) -> Tests:
     """The test recordings by split."""
-    world = world_of(skeleton)
-    n = _N_SESSIONS
+    world, n = world_of(skeleton), _N_SESSIONS
     if budget.n_frames is not None:
         n = -(-budget.n_frames // len(world.test_split(world.splits[0], n_sessions=1)[0]))
     splits = (SEALED,) if budget.sealed else world.splits
@@ -399,13 +397,13 @@ def _sensitivities(
     for variant in SWEPT[: 1 if budget.quick else None]:
         if budget.curves:
             sweep = QUICK_SWEEP if budget.quick else Sweep()
-            curve = illustrations.sensitivity(skeleton, variant, sweep, progress)
+            curve = rows.sensitivity(skeleton, variant, sweep, progress)
             curves[variant] = {**curve, "made": _made_by(command), "origin": "measured"}
         elif variant in kept:
             curves[variant] = {**kept[variant], "origin": "kept"}
         else:
-            again = _command_for(skeleton.name, CURVES)
-            missing[f"Fig. 7, {variant}"] = f"no curve is kept; {again} measures it"
+            why = f"no curve is kept; {_command_for(skeleton.name, CURVES)} measures it"
+            missing[f"Fig. 7, {variant}"] = why
     return curves
 
 
@@ -466,7 +464,7 @@ def measure_further(
         )
     if "actions" not in without:
         further["actions"] = _actions("fish", _QUICK_STRIDE if quick else 1, progress)
-        further["key_frames"] = illustrations.acted_key_frames("fish")
+        further["key_frames"] = rows.acted_key_frames("fish")
     if nyu is None:
         why = f"no folder was named with --nyu; with the data `{_VERBS['nyu']}` makes it"
         further["missing"]["nyu"] = why

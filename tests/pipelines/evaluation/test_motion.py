@@ -31,18 +31,18 @@ def back(bend: float = 0.0, rise: float = 0.0, turn: float = 0.0, nod: float = 0
 
 
 def test_a_straight_animal_bends_nowhere_and_a_bent_one_by_what_it_was_bent() -> None:
-    straight = motion.Motion(back()[None]).posture()
+    straight = motion.PointMotion(back()[None]).posture()
     assert all(
         straight[name] == pytest.approx(0.0, abs=1e-9) for name in straight if name != "stretch"
     )
-    bent = motion.Motion(back(bend=30.0, turn=20.0)[None]).posture()
+    bent = motion.PointMotion(back(bend=30.0, turn=20.0)[None]).posture()
     # the middle of the second and third point lies on the first bone's line, half a bone before
     # the bend
     front = np.degrees(
         np.arctan2(10.0 * np.sin(np.radians(30.0)), 5.0 + 10.0 * np.cos(np.radians(30.0)))
     )
     assert bent["trunk_bend"][0] == pytest.approx(front)
-    reared = motion.Motion(back(rise=40.0, nod=-25.0)[None]).posture()
+    reared = motion.PointMotion(back(rise=40.0, nod=-25.0)[None]).posture()
     assert reared["pitch"][0] == pytest.approx(40.0)
     assert reared["head_pitch"][0] == pytest.approx(-25.0)
     assert reared["trunk_arch"][0] == pytest.approx(0.0, abs=1e-9)
@@ -53,11 +53,8 @@ def test_angles_and_lean_do_not_depend_on_where_the_animal_heads() -> None:
     points = np.stack([back(*rng.normal(0.0, 20.0, 4)) for _ in range(50)])
     a = 2.3
     turned = points @ np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
-    own, other = (
-        motion.Motion(points).posture(),
-        motion.Motion(turned + np.array([5.0, -7.0, 0.0])).posture(),
-    )
-    for name, values in own.items():
+    other = motion.PointMotion(turned + np.array([5.0, -7.0, 0.0])).posture()
+    for name, values in motion.PointMotion(points).posture().items():
         np.testing.assert_allclose(values, other[name], atol=1e-9)
 
 
@@ -67,18 +64,18 @@ def test_speeds_are_those_that_were_walked_and_stop_at_a_break() -> None:
     points[:, :, 0] += 40.0 * np.arange(n)[:, None] / rate  # one length a second
     points[60:] += 500.0  # a jump
     clips = np.arange(n) // 60
-    change = motion.Motion(points, clips, rate).change()
+    change = motion.PointMotion(points, clips, rate).change()
     np.testing.assert_allclose(change["speed"], 1.0)
     assert len(change["speed"]) == n - 4
     np.testing.assert_allclose(change["turning"], 0.0, atol=1e-9)
-    assert motion.Motion(points, clips, None).change() == {}
+    assert motion.PointMotion(points, clips, None).change() == {}
 
 
 def test_a_lean_of_the_points_is_told_and_taken_off() -> None:
     rng = np.random.default_rng(1)
     bends = rng.normal(12.0, 6.0, 400)
-    real = motion.Motion(np.stack([back(bend=b) for b in bends]))
-    virtual = motion.Motion(np.stack([back(bend=b) for b in rng.normal(0.0, 6.0, 400)]))
+    real = motion.PointMotion(np.stack([back(bend=b) for b in bends]))
+    virtual = motion.PointMotion(np.stack([back(bend=b) for b in rng.normal(0.0, 6.0, 400)]))
     told = motion.motion_figures(real, {"drawn": virtual})
     assert told["lean_degrees"]["trunk_bend"] > 5.0
     bent, about = (told["quantiles"][f"trunk_bend{also}"] for also in ("", "_about_lean"))
@@ -89,10 +86,10 @@ def test_a_lean_of_the_points_is_told_and_taken_off() -> None:
 
 def test_the_nearest_posture_may_be_a_mirror_image() -> None:
     left, right = (
-        motion.Motion(np.stack([back(bend=s * 20.0, turn=s * 10.0)] * 2)) for s in (1.0, -1.0)
+        motion.PointMotion(np.stack([back(bend=s * 20.0, turn=s * 10.0)] * 2)) for s in (1.0, -1.0)
     )
     np.testing.assert_allclose(motion.nearest(left, right), 0.0, atol=1e-9)
-    opposed = motion.Motion(np.stack([back(bend=20.0, turn=-60.0)] * 2))
+    opposed = motion.PointMotion(np.stack([back(bend=20.0, turn=-60.0)] * 2))
     assert motion.nearest(left, opposed).min() > 10.0
 
 
@@ -100,13 +97,16 @@ def test_the_nearest_posture_may_be_a_mirror_image() -> None:
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer virtual mice."""
     monkeypatch.setattr(motion, "_SEEDS", range(300, 302))
+    monkeypatch.setattr(motion, "_PER_RECORDING", 30)
     monkeypatch.setattr(motion, "_N_POSTURES", 1600)
 
 
 def own_mouse(path: Path, above: float = 0.4, **also: Any) -> Path:
     """The points of a virtual mouse, as a file of a real one."""
-    bodies = motion._postures(MOUSE)[:400]
-    points = motion.on_back(MOUSE, bodies, np.array([0.0, 0.3, 0.55, 0.7, 1.0]), above)
+    pose, girth, shape = (part[:400] for part in motion._postures(MOUSE))
+    points = motion.on_back(
+        MOUSE, (pose, girth, shape), np.array([0.0, 0.3, 0.55, 0.7, 1.0]), above
+    )
     feet = points[:, :1] - [0.0, 0.0, 9.0]
     np.savez(path, points_mm=np.concatenate([points, feet], axis=1), names=[*NAMES, "Foot"], **also)
     return path
@@ -136,6 +136,7 @@ def test_a_stated_rate_tells_speeds(tmp_path: Path) -> None:
     assert set(figures["quantiles"]["speed"]) == {"real", "walk"}
 
 
+@pytest.mark.usefixtures("few")
 def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
     file = own_mouse(tmp_path / "mouse.npz")
     for words, expected in (
@@ -156,6 +157,7 @@ def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
             motion.read_motion(path, NAMES, "z", None)
 
 
+@pytest.mark.usefixtures("few")
 def test_frames_without_a_point_are_left_out_and_are_a_break(tmp_path: Path) -> None:
     file = own_mouse(tmp_path / "mouse.npz")
     with np.load(file) as held:
@@ -172,6 +174,7 @@ def test_frames_without_a_point_are_left_out_and_are_a_break(tmp_path: Path) -> 
         motion.read_motion(file, NAMES, "z", None)
 
 
+@pytest.mark.nightly
 def test_postures_of_training_hold_those_of_a_real_mouse(reference_data: Path) -> None:
     file = reference_data / "mouse_motion_3d" / "mouse_motion_3d.npz"
     figures = motion.evaluate_motion(file, up="-y")

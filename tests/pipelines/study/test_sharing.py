@@ -12,8 +12,7 @@ import pytest
 from liex_lab.pipelines.correct import correct_session
 from liex_lab.pipelines.study import sharing
 from liex_lab.pipelines.study.crew import measure_one
-from liex_lab.pipelines.study.listing import list_sessions, study_rows
-from liex_lab.pipelines.study.run import run_study
+from liex_lab.pipelines.study.run import list_sessions, run_study, study_rows
 from liex_lab.pipelines.study.sharing import shared_sessions, to_be_looked_at
 from liex_lab.pipelines.study.status import SessionStatus, standings
 
@@ -38,14 +37,16 @@ class Here:
             finished(measure_one(one.session, run))
 
 
-@pytest.fixture(autouse=True)
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    @contextmanager
-    def crew_of(n_tasks: int, **_: Any) -> Any:
-        assert n_tasks > 0
-        yield Here()
+@contextmanager
+def here(n_tasks: int, **_: Any) -> Any:
+    """Stands in for `crew_of`."""
+    assert n_tasks > 0
+    yield Here()
 
-    monkeypatch.setattr("liex_lab.pipelines.study.run.crew_of", crew_of)
+
+@pytest.fixture(autouse=True)
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("liex_lab.pipelines.study.run.crew_of", here)
     monkeypatch.setattr("liex_lab.pipelines.study.run.compile_ahead", lambda _: None)
 
 
@@ -188,66 +189,53 @@ def test_another_session_changes_what_all_of_its_animal_are_measured_with(tmp_pa
     assert [counted(tmp_path, name, "looks") for name in "abc"] == [1, 1, 1]
 
 
-def test_lengths_too_far_apart_are_said_and_not_averaged(tmp_path: Path) -> None:
-    file = make_study(tmp_path, {"m07/a": 80.0, "m07/b": 88.0, "m08/x": 70.0, "m08/y": 71.0})
+def test_who_does_not_share_keeps_its_own_and_the_reason_is_stated(tmp_path: Path) -> None:
+    lengths = {
+        "m06/p": 80.0,
+        "m06/q": 86.5,
+        "m07/a": 80.0,
+        "m07/b": 88.0,
+        "m08/x": 70.0,
+        "m08/y": 71.0,
+        "m08/empty": 1.0,
+        "m08/other": 60.0,
+        "m09/k": 80.0,
+        "m09/empty2": 1.0,
+        "m10/r": 80.0,
+        "m10/s": 82.0,
+        "m10/t": 99.0,
+    }
+    file = make_study(tmp_path, lengths)
+    file.write_text(file.read_text().rstrip() + '\nexclude = "another mouse"\n')
     found = run(file)
-    assert measured_by(found["a"]) is None
-    assert measured_by(found["b"]) is None
+    own = {name for name, one in found.items() if one.state == "done" and not measured_by(one)}
+    assert own == {"a", "b", "other", "k"}
+    assert {name for name, one in found.items() if one.state == "failed"} == {"empty", "empty2"}
+    assert found["t"].state == "excluded"
+    assert measured_by(found["r"])["n_sessions"] == 2
     assert measured_by(found["x"])["spine_mm"] == pytest.approx(70.5, abs=0.01)
-    said = (
+    apart = (
         "The sessions of m07 do not share size and shape: their lengths, 80.0 to 88.0 mm, lie "
         "9.5% apart, more than 8%; each keeps its own."
     )
-    assert [found[name].session.remark for name in "abxy"] == [said, said, "", ""]
-    rows = {row["session_id"]: row for row in study_rows(Study.load(file), [*found.values()])}
-    assert rows["sub-m07_ses-a"]["shared"] == said
-    document = json.loads((found["a"].session.folder / "session.json").read_text())
-    assert document["problems"] == [said]
-    assert run(file)["a"].state == "done", "it is nothing to be done again for"
-    listed = {entry.key: entry.reason for entry in list_sessions(file)[1]()}
-    assert (listed["sub-m07_ses-a"], listed["sub-m08_ses-x"]) == (said, "")
-
-
-@pytest.mark.parametrize(("second", "is_shared"), [(86.5, True), (86.9, False)])
-def test_eight_hundredths_of_the_length_are_the_limit(
-    tmp_path: Path, second: float, is_shared: bool
-) -> None:
-    found = run(make_study(tmp_path, {"m07/a": 80.0, "m07/b": second}))
-    assert (measured_by(found["a"]) is not None) == is_shared
-
-
-def test_a_session_that_does_not_show_the_animal_keeps_to_itself(tmp_path: Path) -> None:
-    file = make_study(tmp_path, {"m07/a": 80.0, "m07/b": 82.0, "m07/empty": 1.0, "m07/other": 60.0})
-    found = run(file)
-    assert found["empty"].state == "failed"
-    assert measured_by(found["a"])["n_sessions"] == 2
-    assert measured_by(found["other"]) is None
+    assert [found[name].session.remark for name in "abxypq"] == [apart, apart, "", "", "", ""]
+    assert found["k"].session.remark.endswith("one of them alone shows the animal.")
     assert found["other"].session.remark == (
-        "sub-m07_ses-other does not share size and shape with the other sessions of m07: its body "
+        "sub-m08_ses-other does not share size and shape with the other sessions of m08: its body "
         "covers 3% of the outline that is seen."
     )
-    run(file)
-    assert counted(tmp_path, "empty", "looks") == 1
+    rows = {row["session_id"]: row for row in study_rows(Study.load(file), [*found.values()])}
+    assert rows["sub-m07_ses-a"]["shared"] == apart
+    document = json.loads((found["a"].session.folder / "session.json").read_text())
+    assert document["problems"] == [apart]
+    listed = {entry.key: entry.reason for entry in list_sessions(file)[1]()}
+    assert (listed["sub-m07_ses-a"], listed["sub-m08_ses-x"]) == (apart, "")
+    assert run(file)["a"].state == "done", "it is nothing to be done again for"
+    counts = [counted(tmp_path, name, "looks") for name in ("t", "x", "empty")]
     run(file, retry=True)
-    assert counted(tmp_path, "empty", "looks") == 2
-    assert counted(tmp_path, "a", "looks") == 1
-    assert counted(tmp_path, "a", "runs") == 1
-
-
-def test_where_one_session_alone_shows_the_animal_nothing_is_shared(tmp_path: Path) -> None:
-    found = run(make_study(tmp_path, {"m07/a": 80.0, "m07/empty": 1.0}))
-    assert measured_by(found["a"]) is None
-    assert found["a"].session.remark.endswith("one of them alone shows the animal.")
-
-
-def test_excluded_sessions_and_other_animals_have_no_say(tmp_path: Path) -> None:
-    file = make_study(tmp_path, {"m07/a": 80.0, "m07/b": 82.0, "m07/c": 99.0})
-    text = file.read_text()
-    file.write_text(text.rstrip() + '\nexclude = "another mouse"\n')
-    found = run(file)
-    assert measured_by(found["a"])["n_sessions"] == 2
-    assert found["c"].state == "excluded"
-    assert counted(tmp_path, "c", "looks") == 0
+    again = [counted(tmp_path, name, "looks") for name in ("t", "x", "empty")]
+    assert (counts, again) == ([0, 1, 1], [0, 1, 2])
+    assert counted(tmp_path, "x", "runs") == 1
 
 
 def test_who_an_animal_is_changes_without_a_look(tmp_path: Path) -> None:
@@ -262,6 +250,8 @@ def test_who_an_animal_is_changes_without_a_look(tmp_path: Path) -> None:
 def test_a_length_that_the_plan_states_stays_and_is_no_finding(tmp_path: Path) -> None:
     file = make_study(tmp_path, {"m07/a": 80.0, "m07/b": 82.0, "m07/c": 84.0})
     file.write_text(file.read_text() + "set = { animal.spine_mm = 84.0 }\n")
+    assert {one.state for one in run(file, dry_run=True).values()} == {"new"}
+    assert counted(tmp_path, "a", "looks") == 0, "a dry run inspects nobody"
     found = run(file)
     assert measured_by(found["c"])["spine_mm"] == pytest.approx(81.0, abs=0.05)
     document = json.loads((found["c"].session.folder / "session.json").read_text())
@@ -307,13 +297,6 @@ def test_no_look_is_written_through_a_link(tmp_path: Path) -> None:
     assert not list(elsewhere.iterdir())
 
 
-def test_a_dry_run_looks_at_nobody(tmp_path: Path) -> None:
-    file = make_study(tmp_path, {"m07/a": 80.0, "m07/b": 82.0})
-    before = sorted(tmp_path.rglob("*"))
-    assert {one.state for one in run(file, dry_run=True).values()} == {"new"}
-    assert sorted(tmp_path.rglob("*")) == before
-
-
 def test_what_is_shared_is_a_plan_that_comes_back_from_its_file(tmp_path: Path) -> None:
     shape = {"width": [1.1] * 5, "height": [0.9] * 5, "joints_moved": [[0.0, 0.001, -0.01]] * 5}
     body = {"subject": "m07", "n_sessions": 2, "spine_mm": 81.03, "girth": None, "shape": shape}
@@ -332,6 +315,7 @@ def test_what_is_shared_is_a_plan_that_comes_back_from_its_file(tmp_path: Path) 
             Plan.from_table({"animal": {"shared": wrong}})
 
 
+@pytest.mark.nightly
 def test_the_worker_processes_of_a_study_look_and_their_death_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -341,5 +325,5 @@ def test_the_worker_processes_of_a_study_look_and_their_death_is_told(
     assert measured_by(found["a"])["n_sessions"] == 2
     assert measured_by(found["a"]) == measured_by(found["b"])
     assert found["deadly"].state == "failed"
-    (last,) = [one for one in shared_sessions(Study.load(file)) if "deadly" in one.session.id]
-    assert "the worker process died 4 times" in last.session.remark
+    (last,) = [one for one, _ in shared_sessions(Study.load(file)) if "deadly" in one.id]
+    assert "the worker process died 4 times" in last.remark

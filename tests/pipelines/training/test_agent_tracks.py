@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.paper.figures import draw_confusions
 from liex_lab.pipelines.evaluation.actions import one_hour, track_error_mm
-from liex_lab.pipelines.training import agent_tracks as module
-from liex_lab.pipelines.training.agent_tracks import AgentTrack, Scenario, acted, thinned
+from liex_lab.pipelines.training import action_model as module
+from liex_lab.pipelines.training.action_model import AgentTrack, Scenario, acted, thinned
 
 from liex_lab.actions.storage import load_action_model
 from liex_lab.estimation.estimator import PoseEstimator
@@ -73,7 +73,7 @@ def test_a_slower_camera_sees_the_frames_nearest_to_its_times() -> None:
 
 def test_an_hour_is_an_hour_of_frames(recording: AgentTrack) -> None:
     told = one_hour(load_action_model("mouse"), recording.tracked(), hour_s=60.0)
-    usual = np.median(np.diff(recording.seen.times_ns)) * 1e-9
+    usual = np.median(np.diff(recording.observations.times_ns)) * 1e-9
     assert told["frames"] == round(60.0 / usual)
     assert told["seconds"] > 0.0
 

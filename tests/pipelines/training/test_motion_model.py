@@ -5,11 +5,13 @@ truth.
 from __future__ import annotations
 
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from liex_lab.pipelines.training import motion_model
 from liex_lab.pipelines.training.motion_model import (
-    Seen,
+    Measured,
     calibrate_builds,
     calibrate_each_joint,
     calibrate_joints,
@@ -24,35 +26,33 @@ from liex_lab.geometry import so3
 from liex_lab.simulation.corruptions import Event
 from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.track import Track
 from tests.tracking.stories import MOUSE, SUBJECT, noisy, told, walk
 
 SECONDS = np.arange(80) / 30.0
 
 
 @pytest.fixture(scope="module")
-def measured() -> list[Seen]:
+def measured() -> list[Measured]:
     truth = walk(SECONDS)
-    made = []
-    for kind, seed, sd_mm in (("easy", 1, 0.8), ("hard", 2, 2.0)):
-        seen = told(SECONDS, noisy(truth, np.random.default_rng(seed), sd_mm))
-        made.append(
-            Seen(
-                kind, seen, SUBJECT, truth, truth.joints(MOUSE), [Event("hidden", 10, 12)], 0.0, 0.0
-            )
+    joints, events = truth.joints(MOUSE), [Event("hidden", 10, 12)]
+    return [
+        Measured(
+            kind,
+            told(SECONDS, noisy(truth, np.random.default_rng(seed), sd_mm)),
+            *(SUBJECT, truth, joints, events, 0.0, 0.0),
         )
-    return made
+        for kind, seed, sd_mm in (("easy", 1, 0.8), ("hard", 2, 2.0))
+    ]
 
 
-def error(measured: list[Seen], tuning: TrackingParameters) -> float:
-    tracks = [track_whole(each.subject, each.seen, (), tuning).track for each in measured]
-    return float(
-        np.mean(
-            [
-                each.errors(track.joints_mm).mean()
-                for each, track in zip(measured, tracks, strict=True)
-            ]
-        )
-    )
+def tracked(each: Measured, tuning: TrackingParameters) -> Track:
+    return track_whole(each.subject, each.observations, (), tuning).track
+
+
+def error(measured: list[Measured], tuning: TrackingParameters) -> float:
+    errors = [each.errors(tracked(each, tuning).joints_mm).mean() for each in measured]
+    return float(np.mean(errors))
 
 
 def flat(value: object) -> list[float]:
@@ -81,29 +81,24 @@ def test_a_search_mends_what_was_set_wrong(measured):
     assert search(measured, good, 0, np.random.default_rng(3)) == good
 
 
-def covered(measured: list[Seen], tuning: TrackingParameters) -> list[float]:
+def covered(measured: list[Measured], tuning: TrackingParameters) -> list[float]:
     """Of each sequence the share of joint coordinates within their 90 % intervals."""
-    shares, (per_blur, per_spread) = [], tuning.motion.stretch
+    shares = []
     for each in measured:
-        stretch_sd = float(np.hypot(per_blur * each.blur, per_spread * each.size_spread))
-        track = track_whole(
-            replace(each.subject, stretch_sd=stretch_sd), each.seen, (), tuning
-        ).track
-        shares.append(
-            float(np.mean(np.abs(track.joints_mm - each.truth) < 1.645 * track.sd_mm[..., None]))
-        )
+        stretch_sd = tuning.motion.stretch_sd(each.blur, each.size_spread)
+        track = tracked(replace(each, subject=replace(each.subject, stretch_sd=stretch_sd)), tuning)
+        inside = np.abs(track.joints_mm - each.truth) < 1.645 * track.sd_mm[..., None]
+        shares.append(float(inside.mean()))
     return shares
 
 
 def test_an_honest_track_covers_nine_in_ten(measured):
-    mouse = TrackingParameters.of("mouse").motion
+    mouse = TrackingParameters.of("mouse")
     # joints get widths of their own afterwards, which here would be those of other errors
-    wrong = replace(mouse, calibration=((0.03, 0.3),), joint_calibration=())
-    tuning = calibrate_joints(
-        measured, TrackingParameters(TrackingParameters.of("mouse").chain, wrong)
-    )
-    knots = tuning.motion.calibration
-    assert [said for said, _ in knots] == sorted(said for said, _ in knots)
+    wrong = with_motion(mouse, calibration=((0.03, 0.3),), joint_calibration=())
+    tuning = calibrate_joints(measured, wrong)
+    stated = [at for at, _ in tuning.motion.calibration]
+    assert stated == sorted(stated)
     assert 0.86 < np.mean(covered(measured, tuning)) < 0.94
 
 
@@ -125,18 +120,29 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
     assert np.ptp(covered(sequences, tuning)) < 0.5 * np.ptp(covered(sequences, alike))
 
 
-def test_heights_that_are_off_throughout_a_recording_are_covered(measured):
-    tuning = TrackingParameters.of("mouse")
-    builds = [
-        replace(measured[k % 2], truth=np.add(measured[k % 2].truth, [0.0, 0.0, up_mm]))
-        for k, up_mm in enumerate((-9.0, -4.0, 5.0, 7.0, 10.0))
-    ]
-    higher = calibrate_builds(builds, tuning)
-    inside = []
-    for each in builds:
-        track = track_whole(each.subject, each.seen, (), higher).track
-        inside.append(np.abs(track.joints_mm - each.truth)[..., 2] <= 1.645 * track.sd_z_mm)
+@pytest.mark.parametrize(
+    ("way", "offs_mm"),
+    [("up", (-9.0, -4.0, 5.0, 7.0, 10.0)), ("along", (-9.0, -5.0, 4.0, 6.0, 9.0))],
+)
+def test_errors_that_last_throughout_a_recording_are_covered(measured, way, offs_mm):
+    tuning, builds, ways = TrackingParameters.of("mouse"), [], []
+    for k, off_mm in enumerate(offs_mm):
+        truth = measured[k % 2].truth
+        along = truth[:, -1] - truth[:, 0]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        ways.append(np.full_like(along, [0.0, 0.0, 1.0]) if way == "up" else along)
+        builds.append(replace(measured[k % 2], truth=truth + off_mm * ways[-1][:, None]))
+    wider, inside = calibrate_builds(builds, tuning), []
+    for each, direction in zip(builds, ways, strict=True):
+        track = tracked(each, wider)
+        off = np.abs(np.einsum("njk,nk->nj", track.joints_mm - each.truth, direction))
+        # half of the variance along the body stands beside x and half beside y
+        beside = np.sqrt(2.0 * track.sd_xy_mm**2 - track.sd_mm**2)
+        inside.append(off <= 1.645 * (track.sd_z_mm if way == "up" else beside))
+        if way == "along":
+            np.testing.assert_array_equal(track.sd_z_mm, track.sd_mm)
     assert 0.85 < np.mean(inside) < 0.95
+    assert way == "up" or wider.motion.unseen_height == tuning.motion.unseen_height
     blind = calibrate_builds([], tuning).motion
     assert (blind.unseen_height, blind.unseen_shift) == (0.0, 0.0)
 
@@ -148,59 +154,33 @@ def test_each_joint_has_intervals_of_its_own(measured):
     wrong = []
     for known in measured:
         each = replace(known, subject=replace(known.subject, stretch_sd=0.0))  # as of no blur
-        track = track_whole(each.subject, each.seen, (), with_motion(plain, joint_calibration=()))
-        sd = track.track.sd_mm[..., None] * np.array([3.0, 1.0, 1.0, 0.2, 1.0])[:, None]
+        track = tracked(each, with_motion(plain, joint_calibration=()))
+        sd = track.sd_mm[..., None] * np.array([3.0, 1.0, 1.0, 0.2, 1.0])[:, None]
         off = sd * rng.standard_normal(each.truth.shape)
-        wrong.append(replace(each, truth=track.track.joints_mm + off))
+        wrong.append(replace(each, truth=track.joints_mm + off))
     tuning = calibrate_each_joint(wrong, plain)
     rump, *inner, neck, _ = tuning.motion.joint_calibration
     assert rump > 2.0
     assert neck < 0.4
     assert inner == [1.0, 1.0], "what holds nine in ten stays as it is"
-    held = np.concatenate(
-        [
-            np.abs(track.joints_mm - each.truth) <= 1.645 * track.sd_mm[..., None]
-            for each in wrong
-            for track in (track_whole(each.subject, each.seen, (), tuning).track,)
-        ]
-    ).mean(axis=(0, 2))
+    inside = []
+    for each in wrong:
+        track = tracked(each, tuning)
+        inside.append(np.abs(track.joints_mm - each.truth) <= 1.645 * track.sd_mm[..., None])
+    held = np.concatenate(inside).mean(axis=(0, 2))
     assert held.min() > 0.83
     assert held.max() < 0.97
     unseen = with_motion(plain, unseen_height=0.02)
     assert calibrate_each_joint(wrong, unseen).motion.joint_calibration == ()
-
-
-def test_an_animal_without_a_table_of_its_own_has_no_factors_of_the_mouses_joints():
-    assert len(TrackingParameters.of("mouse").motion.joint_calibration) == MOUSE.n_joints
-    assert TrackingParameters.of("starling").motion.joint_calibration == ()
-
-
-def test_bodies_that_lie_further_along_throughout_a_recording_are_covered(measured):
-    tuning = TrackingParameters.of("mouse")
-    builds, ways = [], []
-    for k, forward_mm in enumerate((-9.0, -5.0, 4.0, 6.0, 9.0)):
-        truth = measured[k % 2].truth
-        along = truth[:, -1] - truth[:, 0]
-        ways.append(along / np.linalg.norm(along, axis=1)[:, None])
-        builds.append(replace(measured[k % 2], truth=truth + forward_mm * ways[-1][:, None]))
-    further = calibrate_builds(builds, tuning)
-    assert further.motion.unseen_height == tuning.motion.unseen_height
-    inside = []
-    for each, way in zip(builds, ways, strict=True):
-        track = track_whole(each.subject, each.seen, (), further).track
-        off = np.einsum("njk,nk->nj", track.joints_mm - each.truth, way)
-        # half of the variance along the body stands beside x and half beside y
-        spread = np.sqrt(2.0 * track.sd_xy_mm**2 - track.sd_mm**2)
-        inside.append(np.abs(off) <= 1.645 * spread)
-        np.testing.assert_array_equal(track.sd_z_mm, track.sd_mm)
-    assert 0.85 < np.mean(inside) < 0.95
+    assert len(plain.motion.joint_calibration) == MOUSE.n_joints
+    assert TrackingParameters.of("starling").motion.joint_calibration == (), "not the mouse's"
 
 
 def test_a_height_nobody_sees_is_in_the_error_and_upright_in_the_roots_covariance(measured):
     each = measured[0]
     plain = TrackingParameters.of("mouse")
     higher = with_motion(plain, unseen_height=0.1)
-    before, after = (track_whole(each.subject, each.seen, (), one).track for one in (plain, higher))
+    before, after = (tracked(each, one) for one in (plain, higher))
     there = before.posed & after.posed
     R = before.root_rotation[there]
     more = after.cov_root[there] - before.cov_root[there]
@@ -216,29 +196,44 @@ def test_a_height_nobody_sees_is_in_the_error_and_upright_in_the_roots_covarianc
     np.testing.assert_allclose(after.sd_z_mm[there], np.hypot(before.sd_mm[there], sd_mm))
 
 
-@pytest.mark.slow
-def test_the_table_is_the_same_on_one_thread_and_on_two(tmp_path):
-    made = [
-        train_tracking(
-            "mouse", tmp_path / f"{workers}.toml", n_frames=100, seeds=(31,), workers=workers
-        )
-        for workers in (1, 2)
+def trained_twice(folder: Path, **settings: object) -> list[bytes]:
+    """The file that one thread writes, and that of two."""
+    return [
+        train_tracking("mouse", folder / f"{k}.toml", workers=k, **settings).read_bytes()
+        for k in (1, 2)
     ]
-    assert made[0].read_bytes() == made[1].read_bytes()
+
+
+def test_the_table_is_the_same_on_one_thread_and_on_two(measured, tmp_path, monkeypatch):
+    each_kind = {each.kind: each for each in measured}
+    monkeypatch.setattr(motion_model, "measure", lambda animal, kind, *_: each_kind[kind])
+    monkeypatch.setattr(motion_model, "other_builds", lambda *_: measured[:1])
+    one, two = trained_twice(tmp_path, n_tries=2, seeds=(31,))
+    assert one == two
+
+
+@pytest.mark.nightly
+def test_the_table_of_rendered_sequences_is_the_same_on_one_thread_and_on_two(tmp_path):
+    one, two = trained_twice(tmp_path, n_frames=100, seeds=(31,))
+    assert one == two
+
+
+def test_sequences_are_measured_in_the_arena_that_is_estimated():
+    one = motion_model.measure("mouse", "easy", 31, 16)
+    track = tracked(one, TrackingParameters.of("mouse"))
+    assert np.nanmedian(np.linalg.norm(track.joints_mm - one.truth, axis=-1)) < 8.0
 
 
 def test_roots_and_bends_are_covered_as_well(measured):
     tuning = calibrate_roots(measured, TrackingParameters.of("mouse"))
     turned, placed, bent = [], [], []
+    free = MOUSE.axes[1:]
     for each in measured:
-        track = track_whole(each.subject, each.seen, (), tuning).track
+        track = tracked(each, tuning)
         off = track.root.inverse() @ each.pose.root
         turned.append(np.abs(so3.log(off.rotation)) / track.sd_root[:, :3])
         placed.append(np.abs(off.translation) / track.sd_root[:, 3:])
-        free = MOUSE.axes[1:]
-        bent.append(
-            (np.abs(track.angles_rad - each.pose.angles)[:, 1:][:, free])
-            / track.sd_angles_rad[:, 1:][:, free]
-        )
+        angles = np.abs(track.angles_rad - each.pose.angles)
+        bent.append(angles[:, 1:][:, free] / track.sd_angles_rad[:, 1:][:, free])
     for z in (turned, placed, bent):
         assert 0.85 < np.mean(np.concatenate(z) < 1.645) < 0.95

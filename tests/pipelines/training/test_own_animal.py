@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,13 +21,14 @@ from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.sessions import Session
 from liex_lab.simulation import recording as synthetic
+from liex_lab.simulation import training_patches
 
 SNAKE = str(find_sample("snake.toml"))
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A model of the snake, from few pictures and few shallow trees."""
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few shallow trees."""
     default = methods.METHODS["default"]
     small = replace(
         default,
@@ -41,23 +41,52 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         regressors=replace(default.regressors, n_trees=5, max_depth=12, n_tests=50),
         metric=replace(default.metric, n_trees=16, max_depth=7, n_tests=40),
     )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(methods.METHODS, "default", small)
-        yield pose_model.train_model(
-            SNAKE, "default", tmp_path_factory.mktemp("models") / "snake.npz", n_images=1024
-        )
+    monkeypatch.setitem(methods.METHODS, "default", small)
 
 
-def test_the_model_knows_its_animal_and_how_it_is_looked_at(model):
+def run(model: Path, folder: Path, n_frames: int) -> tuple[Session, np.ndarray]:
+    """A session by the plan of the tutorial, and the x coordinates of its joints, mm."""
+    plan = folder / "plan.toml"
+    plan.write_text(f'[animal]\nskeleton = "{SNAKE}"\n\n[estimation]\nmodel = "{model}"\n')
+    recording = open_recording(
+        f"synthetic:move?animal={SNAKE}&seed=2&frames={n_frames}&spine_mm=250"
+    )
+    session = Session.open(run_session(recording, Plan.load(plan), folder))
+    joints = session.poses.pivot(index="frame_index", columns="joint", values="x_mm")
+    assert joints.shape == (n_frames, 9)
+    assert (session.path / "report.html").is_file()
+    off = joints.to_numpy().mean(axis=1) - recording.joints_arena[..., 0].mean(axis=1)  # type: ignore[attr-defined]
+    return session, off
+
+
+@pytest.mark.usefixtures("small")
+def test_a_model_is_trained_and_runs_with_the_plan_of_the_tutorial(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training_patches, "BLOCK", 64)
+    model = pose_model.train_model(SNAKE, "default", tmp_path / "snake.npz", n_images=256)
     made = Model.load(model)
     assert made.skeleton.name == "snake"
     assert made.skeleton.view == Skeleton.load(SNAKE).view
-    assert made.card["recipe"]["n_images"] == 1024
+    assert made.card["recipe"]["n_images"] == 256
     assert made.method.reach_mm == pytest.approx(22.0 * 240.0 / 52.834, rel=1e-5)
     assert made.calibration.area_mm2 == pytest.approx(4000.0, rel=0.3)
+    again = pose_model.train_model(SNAKE, "default", tmp_path / "again.npz", n_images=256)
+    assert again.read_bytes() == model.read_bytes()
+    session, off = run(model, tmp_path, 20)
+    assert session.metadata["animal"]["name"] == "snake"
+    assert np.isfinite(off).any()
+    plan = plan_of(SNAKE).with_settings(["estimation.model=mouse"])
+    with pytest.raises(PlanError, match="made for the skeleton mouse"):
+        run_session(f"synthetic:move?animal={SNAKE}&frames=3", plan, tmp_path)
 
 
-def test_its_accuracy_is_measured_on_rendered_snakes(model, monkeypatch):
+@pytest.mark.nightly
+@pytest.mark.usefixtures("small")
+def test_a_whole_model_finds_rendered_snakes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = pose_model.train_model(SNAKE, "default", tmp_path / "snake.npz", n_images=1024)
     drawn = synthetic.test_split
     monkeypatch.setattr(
         synthetic, "test_split", lambda name, spine, n, species: drawn(name, spine, 2, species)
@@ -65,21 +94,11 @@ def test_its_accuracy_is_measured_on_rendered_snakes(model, monkeypatch):
     result = evaluate_pose(SNAKE, "clean", model=model)
     assert result["n_frames"] == 100
     assert result["lost_rate"] < 0.05
-    assert result["median_joint_error_mm"] < 30.0  # of 240; a model from 1,024 pictures
-
-
-def test_the_plan_of_the_tutorial_turns_a_recording_into_a_session(model, tmp_path):
-    plan = tmp_path / "plan.toml"
-    plan.write_text(f'[animal]\nskeleton = "{SNAKE}"\n\n[estimation]\nmodel = "{model}"\n')
-    recording = open_recording(f"synthetic:move?animal={SNAKE}&seed=2&frames=40&spine_mm=250")
-    session = Session.open(run_session(recording, Plan.load(plan), tmp_path))
-    joints = session.poses.pivot(index="frame_index", columns="joint", values="x_mm")
-    assert joints.shape == (40, 9)
-    assert joints.notna().to_numpy().mean() > 0.9
-    assert session.metadata["animal"]["spine_mm"] == pytest.approx(250.0, rel=0.15)
-    assert (session.path / "report.html").is_file()
-    off = joints.to_numpy().mean(axis=1) - recording.joints_arena[..., 0].mean(axis=1)  # type: ignore[attr-defined]
+    assert result["median_joint_error_mm"] < 30.0  # of 240; a model from 1,024 images
+    session, off = run(model, tmp_path, 40)
+    assert np.isfinite(off).mean() > 0.9
     assert np.nanmedian(np.abs(off)) < 12.0
+    assert session.metadata["animal"]["spine_mm"] == pytest.approx(250.0, rel=0.15)
 
 
 def test_the_plan_of_an_own_animal_follows_from_its_toml():
@@ -89,9 +108,3 @@ def test_the_plan_of_an_own_animal_follows_from_its_toml():
     assert plan_of("mouse") == Plan.load("mouse")
     assert sizes_of(SNAKE) == (180.0, 240.0, 300.0, 360.0)
     assert sizes_of("fish") == (18.0, 25.0, 32.0, 45.0)
-
-
-def test_a_model_of_another_animal_is_refused(model, tmp_path):
-    plan = plan_of(SNAKE).with_settings(["estimation.model=mouse"])
-    with pytest.raises(PlanError, match="made for the skeleton mouse"):
-        run_session(f"synthetic:move?animal={SNAKE}&frames=3", plan, tmp_path)
