@@ -26,7 +26,7 @@ LIMITS = {
     "pictures?": 370,
     "told": 211,
     "tells?": 82,
-    "seen": 790,
+    "seen": 783,
     "said": 188,
     "says?": 202,
     "whom?": 70,

@@ -339,7 +339,7 @@ class SceneChange:
             sample: (n, H, W) float32 mm, the frames, 0 where unread.
             times_s: (n,) of the frames, s since the first.
             camera: of those pixels.
-            area_mm2: the animal's usual area seen from above, mm^2.
+            area_mm2: the animal's usual area from above, mm^2.
 
         Returns:
             The change; None if the scene does not change, or too few frames are given.

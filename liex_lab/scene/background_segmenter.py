@@ -60,7 +60,7 @@ class BackgroundSubtraction(Segmenter):
         limit: (H, W) float32 mm; a reading below it is foreground.
         on_floor: (H, W) bool, the visible floor: an animal stands on it with at least a part of its
             body.
-        area_mm2: the animal's usual area seen from above, mm^2; 0 while unknown.
+        area_mm2: the animal's usual area from above, mm^2; 0 while unknown.
         volume_mm3: the animal's usual volume under its back, mm^3; 0 while unknown.
         view: how such animals are viewed.
         stride: step between analysed rows and columns of the image; H and W count those.

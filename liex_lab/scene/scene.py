@@ -370,7 +370,7 @@ class Fixture:
     Attributes:
         centre_mm: x and y of its middle, mm, arena frame.
         height_mm: of its top above the floor, mm.
-        area_mm2: seen from the camera, mm^2.
+        area_mm2: from the camera, mm^2.
         since_s: when it was placed there, s since the first frame; None if from the beginning.
         until_s: when it was removed; None if it stays.
     """

@@ -68,7 +68,7 @@ class SupportPlane:
             used; None for the full image.
         n_moving: moving objects of an animal's size in the sampled frames.
         support: their share, by volume, that stands on this floor, 0 to 1; NaN without any.
-        mover_mm2: their median area seen from the camera, mm^2; NaN without any.
+        mover_mm2: their median area from the camera, mm^2; NaN without any.
         n_together: how many of them move in one frame (80 % quantile).
         origin: how the floor was found, see `scene.Scene.floor_from`.
         doubt: a sentence on why this floor may be wrong; empty without doubt.
@@ -98,7 +98,7 @@ class MovingObject:
         rows: of the pixels around it.
         columns: of the same pixels.
         depth: of the background there, mm.
-        area_mm2: of the object seen from the camera.
+        area_mm2: of the object from the camera.
         volume_mm3: between the object and the background.
         frame: row of the sample.
     """

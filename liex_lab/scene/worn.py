@@ -139,7 +139,7 @@ class Worn(ABC):
 
 _NARROW_MM = 5.0  # least height of a narrow part above the wide one
 _STEP_MM = 6.0  # and above the surrounding body
-_AREA_MM2 = (30.0, 260.0)  # seen from above
+_AREA_MM2 = (30.0, 260.0)  # from above
 _BESIDE_PX = 2
 _ON_BODY = 0.3  # least share of animal around it, as the head ends in front
 _LEAST_SHARE = 0.6  # least share of the frames with an animal that show one
@@ -152,7 +152,7 @@ class HeadStage(Worn):
     """How a head stage is separated from the animal in one camera's images.
 
     Attributes:
-        area_mm2: its usual area seen from above, mm^2.
+        area_mm2: its usual area from above, mm^2.
     """
 
     area_mm2: float

@@ -354,7 +354,11 @@ def test_sessions_are_collected_with_who_they_are_of(tmp_path):
     assert "observed_s" in table
 
 
-@pytest.mark.parametrize("plan", [PLANS[k] for k in (0, 2, 3, 5)], ids=lambda plan: plan.name)
+@pytest.mark.parametrize(
+    "plan",
+    [pytest.param(PLANS[k], marks=[pytest.mark.nightly] * (k in (2, 3))) for k in (0, 2, 3, 5)],
+    ids=lambda plan: plan.name,
+)
 def test_studies_without_an_effect_are_rarely_called_significant(plan):
     """Forty of each kind; `liex evaluate statistics` makes two thousand. Seven or more are 0.3 %
     likely at 5 %.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
@@ -295,6 +295,7 @@ def gappy_bouts(draw):
     return moved, bouts.assign(duration_s=bouts["stop_s"] - bouts["start_s"])
 
 
+@settings(max_examples=20)
 @given(gappy_bouts())
 def test_named_and_unlabelled_time_is_the_observed_time_whatever_was_lost(case):
     moved, bouts = case
