@@ -76,6 +76,29 @@ def bundled_models(folder: Path = MODELS) -> dict[str, dict[str, Any]]:
     }
 
 
+def find_file(name: str | Path, folder: Path, suffix: str, what: str, own: str) -> Path:
+    """Path of a bundled file by its name, or of a user's own file.
+
+    Args:
+        name: a bundled name, such as 'mouse', or a path.
+        folder: of the bundled files.
+        suffix: of them.
+        what: of what kind they are, for the message.
+        own: how a user gets a file of one's own, for the message.
+
+    Raises:
+        ModelError: there is no such file; the message names the closest bundled one.
+    """
+    bundled = folder / f"{name}{suffix}"
+    path = bundled if bundled.is_file() else Path(name)
+    if not path.is_file():
+        known = sorted(p.stem for p in folder.glob(f"*{suffix}"))
+        near = difflib.get_close_matches(str(name), known, 1)
+        hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
+        raise ModelError(f"there is no {what} '{name}'; {hint}, or give the path of {own}")
+    return path
+
+
 def find_model(model: str | Path, folder: Path = MODELS) -> Path:
     """Path of a model file, after checking its SHA-256 against its card.
 
@@ -89,17 +112,9 @@ def find_model(model: str | Path, folder: Path = MODELS) -> Path:
     Raises:
         ModelError: there is no such model, or it is damaged or was changed.
     """
-    bundled = folder / f"{model}.npz"
-    path = bundled if bundled.is_file() else Path(model)
-    if not path.is_file():
-        known = [p.stem for p in sorted(folder.glob("*.npz"))]
-        near = difflib.get_close_matches(str(model), known, 1)
-        hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
-        raise ModelError(
-            f"there is no model '{model}'; {hint}, or give the path of an .npz made by `liex train`"
-        )
+    path = find_file(model, folder, ".npz", "model", "an .npz made by `liex train`")
     card_path = path.with_suffix(".json")
-    if path == bundled or card_path.is_file():
+    if path == folder / f"{model}.npz" or card_path.is_file():
         stated = _read_card(card_path)["sha256"]
         found = sha256(path)
         if stated != found:

@@ -82,8 +82,7 @@ def learn(
     progress(1, 3, "training the networks")
     networks = tuple(train_network(examples, len(words), seed + k) for k in range(_MEMBERS))
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
-    speeds = speeds_of(examples, len(words))
-    peaks = peaks_of(examples, len(words))
+    speeds, peaks = speeds_of(examples, len(words))
     chain = SemiMarkovModel.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
         skeleton,
@@ -114,46 +113,33 @@ def vocabulary_of(tracks: Sequence[LabelledTrack]) -> tuple[str, ...]:
     return (UNLABELLED, *found)
 
 
-def speeds_of(examples: Examples, n_words: int) -> Array:
-    """The 0.5 % and 99 % quantiles of the speed of each word's ticks.
+def speeds_of(examples: Examples, n_words: int) -> tuple[Array, Array]:
+    """The range of each word's speed, and the least peak speed of its bouts.
+
+    The range is from the 0.5 % to the 99 % quantile over the word's ticks; 0 to infinity for
+    `UNLABELLED` and words without ticks. The peak is the one that 99 % of the bouts of a fast word
+    exceed; a word is fast if the median over its bouts of their mean speed is above one length per
+    second. Other words have 0, because another animal may be slower than all animals of the
+    training data.
 
     Args:
         examples: the training data.
         n_words: size K of the vocabulary, `UNLABELLED` first.
 
     Returns:
-        (K, 2) body lengths per second; 0 to infinity for `UNLABELLED` and words without ticks.
+        (K, 2) and (K,) body lengths per second.
     """
-    limits = np.tile([0.0, np.inf], (n_words, 1))
-    for k in range(1, n_words):  # 0 is UNLABELLED
-        speed = examples.speed[examples.code == k]
-        if len(speed):
-            limits[k] = np.quantile(speed, _USUAL)
-    return limits
-
-
-def peaks_of(examples: Examples, n_words: int) -> Array:
-    """The peak speed that 99 % of the bouts of each fast word exceed.
-
-    A word is fast if the median over its bouts of their mean speed is above one length per second.
-    Other words have 0, because another animal may be slower than all animals of the training data.
-
-    Args:
-        examples: the training data.
-        n_words: size K of the vocabulary, `UNLABELLED` first.
-
-    Returns:
-        (K,) body lengths per second.
-    """
-    least = np.zeros(n_words)
+    limits, least = np.tile([0.0, np.inf], (n_words, 1)), np.zeros(n_words)
     starts, stops, codes = runs_of(examples.code + n_words * examples.recording)
     peak = np.maximum.reduceat(examples.speed, starts)
     mean = np.add.reduceat(examples.speed, starts) / (stops - starts)
     for k in range(1, n_words):  # 0 is UNLABELLED
         own = codes % n_words == k
-        if own.any() and np.median(mean[own]) > _FAST:
-            least[k] = np.quantile(peak[own], _LEAST_PEAK)
-    return least
+        if own.any():
+            limits[k] = np.quantile(examples.speed[examples.code == k], _USUAL)
+            if np.median(mean[own]) > _FAST:
+                least[k] = np.quantile(peak[own], _LEAST_PEAK)
+    return limits, least
 
 
 def train_network(examples: Examples, n_words: int, seed: int) -> Network:

@@ -5,7 +5,6 @@ Format 2; format 1 had no peaks and is still read.
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 import zipfile
@@ -17,7 +16,7 @@ import numpy as np
 
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.actions.timeline import SemiMarkovModel, TimelineModel
-from liex_lab.catalog import MODELS, sha256
+from liex_lab.catalog import MODELS, find_file, sha256
 from liex_lab.errors import ModelError
 from liex_lab.mlp import Network, check_layers
 from liex_lab.runtime.durable import replacing
@@ -243,17 +242,8 @@ def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
     Raises:
         ModelError: there is no such file; the message names the closest bundled model.
     """
-    bundled = folder / f"{name}{SUFFIX}"
-    path = bundled if bundled.is_file() else Path(name)
-    if not path.is_file():
-        known = bundled_action_models(folder)
-        near = difflib.get_close_matches(str(name), known, 1)
-        hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
-        raise ModelError(
-            f"there is no action model '{name}'; {hint}, or give the path of a {SUFFIX} file made "
-            "by `liex train actions`"
-        )
-    return path
+    own = f"a {SUFFIX} file made by `liex train actions`"
+    return find_file(name, folder, SUFFIX, "action model", own)
 
 
 def bundled_action_models(folder: Path = MODELS) -> list[str]:

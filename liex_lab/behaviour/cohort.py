@@ -207,7 +207,9 @@ def _compare_one(
     try:
         units = find_units(rows, groups, blocks)
         row |= {"unit": units.unit, "smallest_p": smallest_p(units)}
-        row["n_reference"], row["n_group"] = _counts(units)
+        n, n_second = len(units.values), int(units.second.sum())
+        # paired units count in both
+        row["n_reference"], row["n_group"] = (n, n) if units.paired else (n - n_second, n_second)
         if float(np.ptp(units.values)) == 0.0 and not (units.paired and units.values[0] != 0.0):
             raise NotComparable("every unit has the same value, so there is nothing to compare")
         row |= _sized(estimate(units), rows, groups)
@@ -215,13 +217,6 @@ def _compare_one(
     except NotComparable as reason:
         row["refused"] = str(reason)
     return row
-
-
-def _counts(units: Units) -> tuple[int, int]:
-    """Units of the reference and of the group; paired units count in both."""
-    n_second = int(units.second.sum())
-    n = len(units.values)
-    return (n, n) if units.paired else (n - n_second, n_second)
 
 
 def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:
