@@ -82,6 +82,7 @@ def test_an_open_table_has_no_shape() -> None:
     assert np.isnan(arena.wall_distance_mm(np.zeros((3, 2)))).all()
 
 
+@settings(max_examples=25)
 @given(
     x=st.floats(-300, 300),
     y=st.floats(-300, 300),

@@ -125,7 +125,7 @@ def test_a_region_on_the_command_line_that_is_none_is_told_how_to_write_one(word
 def test_the_doctor_looks_within_a_circle_of_millimetres_and_says_where_it_is_none():
     from liex_lab.cli.main import app
 
-    walk = "synthetic:walk?frames=30&seed=3"
+    walk = "synthetic:walk?frames=30&seed=3&sensor=primesense-qvga"
     inside = CliRunner().invoke(app, ["doctor", walk, "--region", "circle 0,0 150 mm"])
     assert inside.exit_code == 0, inside.output
     outside = CliRunner().invoke(app, ["doctor", walk, "--region", "circle 9000,0 150 mm"])
