@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from liex_lab.pipelines.training import shape_model
 from liex_lab.pipelines.training.shape_model import PER_SESSION, MiniSession, mini_sessions
 
 from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior
@@ -98,4 +101,4 @@ def test_the_bundled_shapes_make_the_error_of_unseen_builds_smaller(others):
 
 def test_animals_that_are_no_tube_are_refused():
     with pytest.raises(LiexError, match="one chain with a tube"):
-        list(mini_sessions(PoseEstimator.load("hand"), "wide", 1))
+        list(mini_sessions(SimpleNamespace(skeleton=Skeleton.load("hand")), "wide", 1))  # type: ignore[arg-type]
