@@ -97,7 +97,7 @@ def draw_paper(results: Results, further: Mapping[str, Any], folder: Path) -> li
         title = "NYU test frames, 14 points: labels, blue; answer, red"
         written.append(draw_poses(title, further["nyu_hands"], folder / "fig12_nyu_hands.png"))
     if further["tracking"]:
-        written.append(draw_tracking(*further["tracked"], folder / "fig18_tracking.png"))
+        written.append(draw_tracking(*further["tracked"], path=folder / "fig18_tracking.png"))
     if further["actions"]:
         written.append(draw_key_frames(further["key_frames"], folder / "fig19_key_frames.png"))
         written.append(draw_confusions(further["actions"], folder / "fig20_confusions.png"))
@@ -422,7 +422,7 @@ def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
         for joints in skeletons:
             _bones(panel, joints, act["edges"], "#3a4046", 0.9, None)
         order = np.linspace(0, 1, len(along))
-        panel.scatter(*along.T, c=order, cmap="coolwarm", s=9, zorder=3)
+        panel.scatter(along[:, 0], along[:, 1], c=order, cmap="coolwarm", s=9, zorder=3)
         everything = np.concatenate([along, *bodies, *skeletons])
         low, high = everything.min(axis=0), everything.max(axis=0)
         half = 0.5 * float((high - low).max()) + 8.0  # square, in any direction

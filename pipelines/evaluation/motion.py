@@ -364,11 +364,12 @@ def _height_of(real: PointMotion, skeleton: Skeleton, bodies: Bodies, along: Arr
     is unknown.
     """
     target = float(np.median(real.posture()["trunk_arch"]))
-    pose, girth, shape = (part[: _N_POSTURES // 8] for part in bodies)
+    some = slice(_N_POSTURES // 8)
+    bodies = bodies[0][some], bodies[1][some], bodies[2][some]
     low, high = 0.0, 1.0
     for _ in range(12):
         above = 0.5 * (low + high)
-        points = on_back(skeleton, (pose, girth, shape), along, above)
+        points = on_back(skeleton, bodies, along, above)
         arch = np.median(PointMotion(points).posture()["trunk_arch"])
         low, high = (above, high) if arch < target else (low, above)
     return round(0.5 * (low + high), 3)
