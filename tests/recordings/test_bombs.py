@@ -24,7 +24,6 @@ import pytest
 import tifffile
 from mcap.writer import Writer
 
-from liex_lab.catalog import MODELS
 from liex_lab.errors import LiexError, ModelError, RecordingError, StudyError
 from liex_lab.estimation.model import Model
 from liex_lab.plan.study import Study
@@ -270,11 +269,6 @@ def test_a_model_that_claims_more_numbers_than_it_has_is_refused(tmp_path: Path)
     )
     with pytest.raises(ValueError, match="no archive"):
         check_npz(io.BytesIO(b"PK nothing"), 100)
-
-
-def test_bundled_models_are_within_the_bounds() -> None:
-    for path in sorted(MODELS.glob("*.npz")):
-        check_npz(path, 1 << 30)
 
 
 def test_entities_of_xml_are_bounded_and_none_is_read_from_elsewhere(tmp_path: Path) -> None:

@@ -48,22 +48,8 @@ def test_room_is_used_again_only_when_nobody_holds_a_frame_in_it() -> None:
     assert third[0].depth.ctypes.data == at
 
 
-def test_pictures_of_another_size_get_room_of_their_own() -> None:
-    rooms = FrameRooms()
-    rooms.filled(FRAMES, 6)
-    small = [DepthFrame(0, 0, np.ones((2, 3), np.float32))]
-    np.testing.assert_array_equal(rooms.filled(small, 6)[0].depth, 1.0)
-
-
 def test_one_reading_anywhere_is_enough() -> None:
     depth = np.zeros((40, 50), np.float32)
     assert not has_readings(depth)
     depth[-1, -3] = 900.0
     assert has_readings(depth)
-
-
-def test_rooms_that_somebody_holds_are_not_kept_for_ever() -> None:
-    rooms = FrameRooms()
-    held = [rooms.filled(FRAMES, 6) for _ in range(9)]
-    assert len({frames[0].depth.ctypes.data for frames in held}) == 9
-    assert len(rooms._rooms) == 6

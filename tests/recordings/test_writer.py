@@ -149,16 +149,6 @@ def test_depth_between_millimetres_is_metres_in_32_bits(tmp_path: Path) -> None:
         np.testing.assert_array_equal([frame.depth for frame in recording], depths)
 
 
-def test_metres_from_a_float_recording_come_back_bit_by_bit(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    stored = rng.uniform(0.3, 6.0, (4, 48, 64)).astype(np.float32)
-    depths = np.stack([depth_mm(frame, 1000.0) for frame in stored])
-    writer = McapDepthWriter(tmp_path / "r.mcap", SMALL)
-    assert len(fill(writer, depths)) == 1
-    with open_recording(writer.path) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], depths)
-
-
 @given(st.lists(st.floats(0, 70_000, width=32), min_size=1, max_size=20))
 def test_metres_are_the_nearest_there_are(values: list[float]) -> None:
     depth = np.array([values], np.float32)

@@ -290,13 +290,6 @@ def test_the_calibration_of_another_lens_is_doubted(
         assert recording.doubts == []  # what the sentence asks for settles it
 
 
-def test_foxgloves_calibration_of_another_lens_is_doubted(tmp_path: Path) -> None:
-    for frame_id, n in ((COLOUR, 1), (DEPTH, 0)):
-        path = write_json(tmp_path / "r.mcap", {}, frame_id=DEPTH, lens_frame_id=frame_id)
-        with open_recording(path) as recording:
-            assert len(recording.doubts) == n
-
-
 @pytest.mark.parametrize(
     "info",
     [
@@ -333,10 +326,6 @@ def test_parts_and_bins_of_a_picture_are_mapped(write: Writer, info: Info, topic
         assert (recording.camera.distortion is None) == ("rect" in topic)
         is_exact(recording)
         assert recording.doubts == []
-
-
-def test_a_calibration_of_another_size_is_refused_as_before(write: Writer) -> None:
-    assert "is for pictures of 640 x 480" in refusal(write(infos=[Info(WIDE)]))
 
 
 # units

@@ -91,13 +91,6 @@ def test_big_endian_depth_is_what_metadata_says(folder: Path) -> None:
         np.testing.assert_array_equal(recording.frame(3).depth, STORED[3])
 
 
-def test_seconds_in_timestamps_csv(folder: Path) -> None:
-    (folder / "depth_ts.txt").unlink()
-    (folder / "timestamps.csv").write_text("\n".join(f"{k * 0.05:.6f},0" for k in range(20)))
-    with open_recording(folder) as recording:
-        assert recording.rate_hz == pytest.approx(20)
-
-
 def test_without_stamps_the_usual_rate_is_assumed_and_told(folder: Path) -> None:
     (folder / "depth_ts.txt").unlink()
     with open_recording(folder) as recording:
@@ -105,22 +98,6 @@ def test_without_stamps_the_usual_rate_is_assumed_and_told(folder: Path) -> None
         assert any("30 frames/s was assumed" in problem for problem in recording.problems)
     with open_recording(folder, fps=60) as recording:
         assert recording.rate_hz == pytest.approx(60)
-
-
-def test_counts_that_differ_are_told(folder: Path) -> None:
-    write_moseq_folder(folder, STORED, [str(k * 33.0) for k in range(19)])
-    with open_recording(folder, strict=True) as recording:
-        assert len(recording) == 19
-        assert any("20 frames" in p and "19 time stamps" in p for p in recording.problems)
-
-
-def test_gaps_are_where_the_camera_left_frames_out(folder: Path) -> None:
-    times = np.arange(20) * 33.3
-    times[7:] += 4 * 33.3
-    write_moseq_folder(folder, STORED, [f"{t:.4f}" for t in times])
-    with open_recording(folder) as recording:
-        (gap,) = recording.gaps
-        assert (gap.start_frame, gap.n_frames_missing, gap.reason) == (7, 4, "camera_dropped")
 
 
 @pytest.mark.parametrize(

@@ -442,12 +442,6 @@ def test_no_frame_is_no_recording(path: Path) -> None:
     assert "no depth frames" in refusal(depth_builder([], "16zT").write(path))
 
 
-def test_a_folder_around_one_file_is_that_file(path: Path) -> None:
-    write_oni_file(path, STORED)
-    with open_recording(path.parent) as recording:
-        assert recording.format == "oni"
-
-
 # What damage to one frame of an .oni file costs, and files made to take memory; 200 variants are
 # in test_damage.py.
 
