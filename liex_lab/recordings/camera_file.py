@@ -215,8 +215,8 @@ def fitting(lens: Lens, width: int, height: int, where: str) -> Camera:
     camera = lens if isinstance(lens, Camera) else Camera(*bare, distortion=lens.distortion)
     if (camera.width, camera.height) != (width, height):
         raise RecordingError(
-            f"{where} is for pictures of {camera.width} x {camera.height} pixels, but these have "
-            f"{width} x {height}; state the intrinsics of this picture size"
+            f"{where} is for images of {camera.width} x {camera.height} pixels, but these have "
+            f"{width} x {height}; state the intrinsics of this image size"
         )
     return camera
 

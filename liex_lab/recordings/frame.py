@@ -357,7 +357,7 @@ def region_mask(corners: Sequence[Sequence[float]], width: int, height: int) -> 
     cv2.fillPoly(mask, [np.rint(np.clip(points, -30_000, 30_000)).astype(np.int32)], 1)
     if int(mask.sum()) < _LEAST_REGION_PX:
         raise PlanError(
-            f"arena.region lies outside the picture, whose columns are 0 to {width - 1} and rows "
+            f"arena.region lies outside the image, whose columns are 0 to {width - 1} and rows "
             f"0 to {height - 1}; its corners are x,y in pixels"
         )
     return mask.astype(bool)

@@ -20,7 +20,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
 _READS = (
-    "a folder of 16-bit PNG, TIFF, PGM or PCLZF pictures with a camera.toml, exports of a Raytrix "
+    "a folder of 16-bit PNG, TIFF, PGM or PCLZF images with a camera.toml, exports of a Raytrix "
     "camera with a raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or "
     ".tar.gz), a PrimeSense recording (.oni), an MCAP file or a ROS bag (.bag, .db3)"
 )
@@ -59,12 +59,12 @@ _NOT_READ = {
     ),
     **dict.fromkeys(
         (".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"),
-        "is an 8-bit picture or a video for people to look at, and 16-bit depth was expected; give "
+        "is an 8-bit image or a video for people to look at, and 16-bit depth was expected; give "
         "the depth itself",
     ),
     **dict.fromkeys(
         (".h5", ".npy", ".npz", ".rrd", ".xef", ".svo", ".svo2"),
-        "is in a format that is not read yet; export it as 16-bit PNG pictures, one to a frame",
+        "is in a format that is not read yet; export it as 16-bit PNG images, one to a frame",
     ),
     **dict.fromkeys(
         (".sqlite", ".sqlite3", ".db"),
@@ -248,6 +248,6 @@ def _open_folder(folder: Path, how: _How) -> Recording:
         return _open(folder / files[0], how)
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]
     raise RecordingError(
-        f"{folder} holds no depth pictures and no depth.dat; "
+        f"{folder} holds no depth images and no depth.dat; "
         + (f"give one of these in it: {', '.join(offer[:6])}" if offer else f"give {_READS}")
     )

@@ -52,8 +52,8 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
     # share of an image's pixels lost at its edge
     if lost > 0.05:
         seen.problems.append(
-            f"{lost:.0%} of the pixels leave the picture when the lens distortion is undone; keep "
-            "the animal away from the picture's edge, or check the distortion's coefficients"
+            f"{lost:.0%} of the pixels leave the image when the lens distortion is undone; keep "
+            "the animal away from the image's edge, or check the distortion's coefficients"
         )
     return seen
 

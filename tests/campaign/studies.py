@@ -97,7 +97,7 @@ BROKEN = {
     "empty file": "is empty",
     "cut short": "is cut short or damaged, 75 whole frames",
     "no mcap": "is named like an MCAP file but holds something else",
-    "no depth": "holds no depth pictures",
+    "no depth": "holds no depth images",
     "text": "is named like an MCAP file but holds something else",
     "8 bit": "expected 16-bit depth, got an 8-bit",
     "no animal": "no animal",

@@ -36,7 +36,7 @@ def test_behind_the_lens_is_nan(z: float) -> None:
 
 
 def test_the_axes_point_as_agreed() -> None:
-    """x right, y down, z away; the optical axis meets the picture in (cx, cy)."""
+    """x right, y down, z away; the optical axis meets the image in (cx, cy)."""
     u, v = PRIMESENSE.project([0.0, 0.0, 700.0])
     assert (u, v) == (PRIMESENSE.cx, PRIMESENSE.cy)
     assert PRIMESENSE.project([1.0, 0.0, 700.0])[0] > u

@@ -201,7 +201,7 @@ def test_arenas_that_overlap_are_refused(tmp_path):
 
 def test_an_arena_outside_of_the_picture_is_refused(tmp_path):
     table = {"arenas": [{"name": "far", "region": {"rectangle": [[9000, 9000], [9100, 9100]]}}]}
-    with pytest.raises(PlanError, match=r"the arena far: .*outside the picture"):
+    with pytest.raises(PlanError, match=r"the arena far: .*outside the image"):
         measure_arenas(recording(), Plan.from_table(table), tmp_path)
 
 
@@ -255,7 +255,7 @@ def test_the_doctor_says_what_is_wrong_with_a_region_and_looks_all_the_same():
         ["arena.region=[[9000, 9000], [9100, 9000], [9000, 9100]]"]
     )
     found = examine("synthetic:walk?frames=20", plan)
-    assert any("outside the picture" in problem for problem in found["problems"])
+    assert any("outside the image" in problem for problem in found["problems"])
     assert found["floor_mm"] is not None
 
 

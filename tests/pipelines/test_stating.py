@@ -121,7 +121,7 @@ def test_a_session_of_no_study_gets_a_plan_beside_it_that_a_run_takes(
     ("corners", "why"),
     [
         ([[10, 10], [90, 60], [90, 10], [10, 60]], "sides 1 and 3 of its polygon cross"),
-        ([[500, 10], [600, 10], [600, 90]], "lies outside the picture"),
+        ([[500, 10], [600, 10], [600, 90]], "lies outside the image"),
         ([[10, 10], [11, 10], [11, 11]], "too few to hold an arena"),
         ([[10, 10], [90, 10]], "three or more corners"),
         ([[10, 10], [90, 10], [90]], "region"),

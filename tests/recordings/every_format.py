@@ -73,7 +73,7 @@ class Format:
 
 
 def others(suffix: str) -> Survivors:
-    """Pictures in files of their own: damage to one costs none of the others, and may cost all if
+    """Images in files of their own: damage to one costs none of the others, and may cost all if
     it is the camera.
     """
 
@@ -87,7 +87,7 @@ def others(suffix: str) -> Survivors:
 
 
 def before(ends: Callable[[Path], Sequence[int]], suffix: str) -> Survivors:
-    """Pictures one after the other in one file: those that end before the damage come out. ends:
+    """Images one after the other in one file: those that end before the damage come out. ends:
     where each does.
     """
 
@@ -151,7 +151,7 @@ def _archive_ends(path: Path) -> list[int]:
 
 
 def _avi_ends(path: Path) -> list[int]:
-    """The end of every chunk of pictures, found by looking for their names one after the other."""
+    """The end of every chunk of images, found by looking for their names one after the other."""
     content, ends = path.read_bytes(), []
     at = content.index(b"movi") + 4
     while content[at : at + 4] == b"00dc":
@@ -162,7 +162,7 @@ def _avi_ends(path: Path) -> list[int]:
 
 
 def _mkv_ends(path: Path) -> list[int]:
-    """The end of every picture of the second track, found by looking for the blocks of its size."""
+    """The end of every image of the second track, found by looking for the blocks of its size."""
     content, ends, at = path.read_bytes(), [], 0
     block = b"\xa3" + (2 * 64 * 48 + 4 | 1 << 56).to_bytes(8, "big") + b"\x82"
     while (at := content.find(block, at)) >= 0:
@@ -172,7 +172,7 @@ def _mkv_ends(path: Path) -> list[int]:
 
 
 def _mcap_ends(path: Path) -> list[int]:
-    """For each depth picture the end of its chunk, as the file's own index has it."""
+    """For each depth image the end of its chunk, as the file's own index has it."""
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -188,7 +188,7 @@ def _mcap_ends(path: Path) -> list[int]:
 
 
 def _message_ends(file: MessageFile) -> list[int]:
-    """For each depth picture the end of its chunk, or its own where there are no chunks."""
+    """For each depth image the end of its chunk, or its own where there are no chunks."""
     found = []
     for envelope in file.walk(lambda channel: "Image" in channel.schema, silent):
         assert isinstance(envelope, Envelope)  # it is walked, not listed by an index

@@ -1,4 +1,4 @@
-"""Folders of depth pictures of the rarer kinds. Every writer returns the folder, with camera.toml
+"""Folders of depth images of the rarer kinds. Every writer returns the folder, with camera.toml
 and stamps in it.
 """
 
@@ -124,7 +124,7 @@ def write_raytrix(
 
 
 def points_of(frame: NDArray[Any], camera: Camera = SMALL) -> NDArray[np.float64]:
-    """The points (n, 3) of a depth picture in mm as a Raytrix export has them: y up, z negative."""
+    """The points (n, 3) of a depth image in mm as a Raytrix export has them: y up, z negative."""
     v, u = np.nonzero(frame)
     p = camera.unproject(np.stack([u, v], axis=-1), frame[v, u].astype(float))
     return p * [1.0, -1.0, -1.0]

@@ -44,7 +44,7 @@ class How:
     log_delay_ns: int = 0
     stamped: bool = True
     times_ns: Sequence[int] | None = None
-    frame_id: str | None = None  # of the pictures; None: their topic
+    frame_id: str | None = None  # of the images; None: their topic
     log_ns: Sequence[int] | None = None  # times of logging in place of the delayed ones
     infos: Sequence[Info] | None = None  # calibrations in place of that of the camera
 
@@ -53,7 +53,7 @@ class How:
 class Info:
     """A CameraInfo; `camera` is what it states, and None zeroes.
 
-    at: before which picture it is logged.
+    at: before which image it is logged.
     """
 
     camera: Camera | None
@@ -90,7 +90,7 @@ def ros_messages(ros: int, frames: NDArray[Any], how: How) -> Iterator[tuple[str
 
 
 def depth_message(ros: int, frame: NDArray[Any], time_ns: int, frame_id: str, how: How) -> Any:
-    """One depth picture (mm, or metres where it is float) as a message."""
+    """One depth image (mm, or metres where it is float) as a message."""
     types, header = store(ros).types, _header(ros, time_ns, frame_id)
     if "cloud" in how.kind:
         return _cloud(ros, frame, header, how)
@@ -109,7 +109,7 @@ def depth_message(ros: int, frame: NDArray[Any], time_ns: int, frame_id: str, ho
 
 
 def _packed(frame: NDArray[Any], kind: str) -> tuple[str, bytes]:
-    if kind == "plain png":  # as compressed_image_transport packs a 16-bit picture
+    if kind == "plain png":  # as compressed_image_transport packs a 16-bit image
         return "16UC1; png compressed ", cv2.imencode(".png", frame)[1].tobytes()
     head, encoding = struct.pack("<iff", 0, 0.0, 0.0), "16UC1"
     if kind.startswith("32FC1"):
@@ -123,7 +123,7 @@ def _packed(frame: NDArray[Any], kind: str) -> tuple[str, bytes]:
 
 
 def points_of(frame: NDArray[Any], camera: Camera) -> NDArray[np.float32]:
-    """The points (H, W, 3), m, that a depth picture in mm stands for; NaN where it is unread."""
+    """The points (H, W, 3), m, that a depth image in mm stands for; NaN where it is unread."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     points = camera.unproject(np.stack([u, v], axis=-1), frame.astype(float)) / 1000.0
     points[frame == 0] = np.nan
@@ -211,7 +211,7 @@ def write_ros_mcap(
 ) -> Path:
     """ROS's messages in an MCAP file; `changes` are further facts of `How`.
 
-    sent_ns: times of sending of the pictures; None: those of logging.
+    sent_ns: times of sending of the images; None: those of logging.
     """
     sent = None if sent_ns is None else iter(sent_ns)
     with path.open("wb") as file:

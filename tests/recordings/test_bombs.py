@@ -106,7 +106,7 @@ def test_a_file_with_holes_is_not_filled(tmp_path: Path) -> None:
 
 
 def pictures(folder: Path) -> Path:
-    """A folder for TIFF pictures of 320 x 240."""
+    """A folder for TIFF images of 320 x 240."""
     folder.mkdir()
     (folder / "camera.toml").write_text(LENS)
     return folder
@@ -188,7 +188,7 @@ def test_thousands_of_topics_are_told_as_fast_as_one(tmp_path: Path) -> None:
         for k in range(1 << 14):
             writer.register_channel(f"/topic{k}", "json", schema)
         writer.finish()
-    bounded(lambda: open_recording(path), "holds no depth pictures: its topics are /topic0 ")
+    bounded(lambda: open_recording(path), "holds no depth images: its topics are /topic0 ")
 
 
 @pytest.mark.parametrize(

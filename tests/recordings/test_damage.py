@@ -105,7 +105,7 @@ def damage(rng: np.random.Generator, path: Path) -> Damage:
 
 
 def read_all(recording: Recording, most: int) -> dict[int, np.ndarray]:
-    """Its frames, each a depth picture; a recording never holds many more than were written."""
+    """Its frames, each a depth image; a recording never holds many more than were written."""
     assert len(recording) <= most
     assert recording.times_ns.dtype == np.int64
     assert np.all(np.diff(recording.times_ns) > 0)

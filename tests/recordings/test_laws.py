@@ -193,7 +193,7 @@ class Bounded(io.BufferedReader):
 
 @pytest.fixture(scope="module")
 def many(form: Format) -> np.ndarray:
-    """Enough frames for a file that must not be read at once; fewer where every picture has a file
+    """Enough frames for a file that must not be read at once; fewer where every image has a file
     of its own.
     """
     return depth_frames(300 if form.streams else 24)
@@ -229,5 +229,5 @@ def test_memory_does_not_grow_with_length(form: Format, many: np.ndarray, tmp_pa
                 assert frame.depth.any()
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    # each further frame may cost some numbers, and never its picture
+    # each further frame may cost some numbers, and never its image
     assert peaks[2] < peaks[1] + (len(many) - quarter) * BYTES / 2

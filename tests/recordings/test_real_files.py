@@ -75,7 +75,7 @@ def test_pcl_recordings_hold_their_times_and_their_camera(
                 640,
                 480,
             )
-            assert lens.source == "the XML files beside the pictures"
+            assert lens.source == "the XML files beside the images"
 
 
 def test_the_encodings_of_data_sets_come_out_as_millimetres(
@@ -169,7 +169,7 @@ def test_pictures_survive_a_way_through_mcap(
 
 def test_an_mcap_without_depth_says_what_it_holds(reference_data: Path) -> None:
     sentence = refusal(reference_data / "depth_files" / "mcap_camera" / "custom-camera-model.mcap")
-    assert "no depth pictures" in sentence
+    assert "no depth images" in sentence
     assert "/image/compressed (foxglove.CompressedImage, json)" in sentence
 
 

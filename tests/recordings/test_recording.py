@@ -144,7 +144,7 @@ def test_the_digest_of_one_file_is_its_own(tmp_path: Path) -> None:
 
 
 def test_the_digest_of_a_folder_sees_names_bytes_and_nothing_else(tmp_path: Path) -> None:
-    folder = write_png_folder(tmp_path / "pictures", STORED)
+    folder = write_png_folder(tmp_path / "images", STORED)
     digest = open_recording(folder).digest()
     (folder / "notes.txt").write_text("mouse 7")
     assert open_recording(folder).digest() == digest
@@ -180,7 +180,7 @@ def test_what_happens_to_a_file_while_it_is_measured_is_known(tmp_path: Path) ->
         assert files.rewritten()
         path.unlink()
         assert (files.rewritten(), files.grown()) == ((), ()), "what is open goes on being read"
-    folder = write_png_folder(tmp_path / "pictures", STORED)
+    folder = write_png_folder(tmp_path / "images", STORED)
     with open_recording(folder) as recording:
         for picture in sorted(folder.glob("*.png"))[:2]:
             os.utime(picture, ns=(0, 0))

@@ -223,7 +223,7 @@ def test_the_straight_picture_holds_what_the_bent_one_held(camera: Camera, most:
 
 def test_much_that_leaves_the_picture_is_told() -> None:
     seen = rectified(recording(replace(CAMERA, distortion=Distortion.of("plumb_bob", [-0.5]))))
-    assert any("leave the picture" in problem for problem in seen.problems)
+    assert any("leave the image" in problem for problem in seen.problems)
     assert not any(
-        "leave the picture" in problem for problem in rectified(recording(CAMERA), WATER).problems
+        "leave the image" in problem for problem in rectified(recording(CAMERA), WATER).problems
     )

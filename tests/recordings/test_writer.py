@@ -40,7 +40,7 @@ WRITERS: dict[str, Any] = {
     "ros png": lambda folder: McapDepthWriter(
         folder / "r.mcap", SMALL, messages="ros", packing="png"
     ),
-    "pictures": lambda folder: PictureFolderWriter(folder / "r", SMALL),
+    "images": lambda folder: PictureFolderWriter(folder / "r", SMALL),
 }
 
 

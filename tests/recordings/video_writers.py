@@ -32,7 +32,7 @@ def write_avi(
     pixels: str = "gray16le",
     level: int = 3,
 ) -> Path:
-    """FFV1 in AVI, one key picture in `gop`; level 3 has check sums and level 1 none."""
+    """FFV1 in AVI, one key image in `gop`; level 3 has check sums and level 1 none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("ffv1", rate=fps)
@@ -80,11 +80,11 @@ def write_mkv(
     live: bool = False,
     groups: bool = False,
 ) -> Path:
-    """Matroska as Azure's recorder writes it: 16-bit big endian pictures without compression,
+    """Matroska as Azure's recorder writes it: 16-bit big endian images without compression,
     tagged `b16g`.
 
     The tracks other than DEPTH hold half its values. live: segment and clusters of open size, as
-    after a crash; groups: pictures in block groups instead of simple blocks; date_ns: since
+    after a crash; groups: images in block groups instead of simple blocks; date_ns: since
     2001-01-01.
     """
     times = even_ms(len(frames)) if times_ms is None else times_ms

@@ -63,7 +63,7 @@ def test_a_floor_that_nothing_stands_on_is_refused():
 @pytest.mark.parametrize(
     ("corners", "message"),
     [
-        ([[400, 300], [500, 300], [500, 400]], "outside the picture"),
+        ([[400, 300], [500, 300], [500, 400]], "outside the image"),
         ([[10, 10], [90, 90], [50, 50]], "encloses 0 pixels"),
         ([[10, 10], [90, 90]], "three or more corners"),
     ],
@@ -130,7 +130,7 @@ def test_the_doctor_looks_within_a_circle_of_millimetres_and_says_where_it_is_no
     assert inside.exit_code == 0, inside.output
     outside = CliRunner().invoke(app, ["doctor", walk, "--region", "circle 9000,0 150 mm"])
     told = " ".join(f"{outside.output}{outside.exception}".split())
-    assert "arena.region lies outside the picture" in told
+    assert "arena.region lies outside the image" in told
 
 
 @pytest.mark.parametrize("command", ["doctor", "run"])

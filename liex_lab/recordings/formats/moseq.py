@@ -750,7 +750,7 @@ class _Session:
         video = DepthVideo(self.depth, self.progress)
         if self.metadata.size not in (None, (video.width, video.height)):
             self.problems.append(
-                f"{METADATA} states pictures of {self.metadata.size}, but those in "
+                f"{METADATA} states images of {self.metadata.size}, but those in "
                 f"{self.depth.name} have {video.width} x {video.height} pixels, which was used"
             )
         if video.truncated or self.cut:
@@ -821,7 +821,7 @@ class _Session:
         else:
             whose = f"the camera {self.metadata.camera_name!r}"
             raise RecordingError(
-                f"{self.path} holds pictures of {width} x {height} pixels from "
+                f"{self.path} holds images of {width} x {height} pixels from "
                 f"{whose if self.metadata.camera_name else 'a camera that is not known'}; write a "
                 "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
                 "pixels"

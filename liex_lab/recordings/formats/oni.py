@@ -425,7 +425,7 @@ def _open(
     probed = np.linspace(0, n - 1, min(n, 5)).astype(int).tolist()
     if all(isinstance(read(i), str) for i in probed):
         raise RecordingError(
-            f"{path} states pictures of {width} x {height} pixels, but its frames do not "
+            f"{path} states images of {width} x {height} pixels, but its frames do not "
             "unpack to that; it is damaged, so copy it again"
         )
     start = start_of_clock(int(monotone.times_ns[0]))
@@ -478,13 +478,13 @@ def _format(path: Path, node: DepthNode, problems: list[str]) -> FrameFormat:
     form = formats[int(np.bincount(used).argmax())]
     if form is None:
         raise RecordingError(
-            f"{path} does not state the size of its pictures (xnMapOutputMode); copy it again"
+            f"{path} does not state the size of its images (xnMapOutputMode); copy it again"
         )
     width, height, unit = form.constant
     # limits the memory for a frame with a damaged header
     if not 0 < width * height <= (1 << 24):
         raise RecordingError(
-            f"{path} states pictures of {width} x {height} pixels, which no depth camera "
+            f"{path} states images of {width} x {height} pixels, which no depth camera "
             "has; it is damaged, so copy it again"
         )
     if unit not in _UNIT_MM:

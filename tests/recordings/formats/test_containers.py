@@ -1,5 +1,5 @@
 """What containers of messages state, compared by value: the calibration of another lens, parts and
-bins of a picture, the RealSense programs' text, packed messages, units, and orders of recording.
+bins of an image, the RealSense programs' text, packed messages, units, and orders of recording.
 """
 
 from __future__ import annotations
@@ -391,7 +391,7 @@ def test_a_message_that_unpacks_to_gigabytes_is_not_unpacked(tmp_path: Path) -> 
     path = write_ros_mcap(
         tmp_path / "r.mcap", STORED[:1], camera=QVGA, pack_message=lambda data: zeros_of
     )
-    assert "no depth pictures" in refusal(path)
+    assert "no depth images" in refusal(path)
 
 
 def test_a_bag_that_is_packed_as_a_whole_names_the_command(tmp_path: Path) -> None:

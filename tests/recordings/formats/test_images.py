@@ -1,4 +1,4 @@
-"""Folders of PNG and TIFF pictures."""
+"""Folders of PNG and TIFF images."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_a_cut_png_is_there_and_wholly_unread(tmp_path: Path, share: float) -> N
             0,
         ]
         assert any(
-            "1 of 12 pictures" in problem and "frame_4.png" in problem
+            "1 of 12 images" in problem and "frame_4.png" in problem
             for problem in recording.problems
         )
         assert not recording.frame(4).depth.any()
@@ -173,7 +173,7 @@ def test_a_single_cut_picture_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("picture", "kind"),
+    ("image", "kind"),
     [
         (np.zeros((48, 64), np.uint8), "an 8-bit grey image of 64 x 48"),
         (np.zeros((48, 64, 3), np.uint8), "an 8-bit colour image of 64 x 48"),
@@ -234,7 +234,7 @@ def test_other_files_beside_the_pictures_do_not_matter(tmp_path: Path) -> None:
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_a_text_that_is_named_like_a_picture_is_refused(tmp_path: Path, suffix: str) -> None:
     folder = write_png_folder(tmp_path / "r", STORED[:0])
-    (folder / f"a{suffix}").write_text("this is not a picture at all, whatever its name may say")
+    (folder / f"a{suffix}").write_text("this is not an image at all, whatever its name may say")
     assert "holds something else" in refusal(folder)
 
 
@@ -366,7 +366,7 @@ def test_a_camera_toml_written_from_a_camera_reads_back(tmp_path: Path) -> None:
         assert recording.problems == []
 
 
-# Pictures of the rarer kinds: PGM in both byte orders, PCLZF, and the encodings of depth that data
+# Images of the rarer kinds: PGM in both byte orders, PCLZF, and the encodings of depth that data
 # sets have.
 
 

@@ -189,7 +189,7 @@ def test_colour_topics_are_not_depth(path: Path) -> None:
     channel.log(image, log_time=5)
     writer.close()
     sentence = refusal(path)
-    assert "no depth pictures" in sentence
+    assert "no depth images" in sentence
     assert "/colour (foxglove.RawImage, protobuf)" in sentence
 
 
@@ -501,12 +501,10 @@ def test_packed_pictures_in_json(tmp_path: Path) -> None:
     "schema", ["foxglove.RawImage", "foxglove.CompressedImage", "foxglove.PointCloud"]
 )
 def test_any_json_is_refused_in_a_sentence(tmp_path: Path, schema: str, message: Any) -> None:
-    assert "no depth pictures" in refusal(
+    assert "no depth images" in refusal(
         write_json(tmp_path / "r.mcap", schema, [message], CALIBRATION)
     )
-    assert "no depth pictures" in refusal(
-        write_json(tmp_path / "r.mcap", schema, [message], message)
-    )
+    assert "no depth images" in refusal(write_json(tmp_path / "r.mcap", schema, [message], message))
 
 
 def write_clouds(path: Path, clouds: list[NDArray[np.float32]], pose: Pose | None = None) -> Path:

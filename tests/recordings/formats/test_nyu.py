@@ -1,4 +1,4 @@
-"""The NYU layout: its pictures as a recording, its joints beside them."""
+"""The NYU layout: its images as a recording, its joints beside them."""
 
 from __future__ import annotations
 

@@ -128,7 +128,7 @@ def test_the_depth_node_is_chosen_by_its_kind_and_not_by_its_name(path: Path) ->
         made.depth_properties(node, 64, 48)
         made.begin(node)
     for k, payload in enumerate(payloads("16zP")):
-        made.frame(2, 1000 * k, b"a picture")
+        made.frame(2, 1000 * k, b"an image")
         made.frame(4, 1000 * k, payload)
         made.frame(3, 1000 * k, bytes(6144))
     made.write(path)
@@ -178,7 +178,7 @@ def test_intrinsics_come_from_the_field_of_view(path: Path) -> None:
         camera = recording.camera
         assert (camera.cx, camera.cy, camera.width, camera.height) == (32, 24, 64, 48)
         assert camera.source == "field of view in the .oni file (xnFOV)"
-        # the angle between the picture's edges, seen from the lens
+        # the angle between the image's edges, seen from the lens
         assert 2 * math.atan(32 / camera.fx) == pytest.approx(1.0)
         assert 2 * math.atan(24 / camera.fy) == pytest.approx(0.8)
 

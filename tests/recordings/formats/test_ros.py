@@ -115,7 +115,7 @@ def test_of_two_points_on_a_pixel_the_nearer_is_seen(tmp_path: Path) -> None:
 def test_loose_points_need_a_picture_to_be_seen_in(write: Writer) -> None:
     path = write(kind="loose cloud", calibrated=False)
     assert "write a camera.toml" in refusal(path)
-    assert "lie in no picture" in refusal(path, camera=Lens(60.0, 61.0, 31.5, 23.5))
+    assert "lie in no image" in refusal(path, camera=Lens(60.0, 61.0, 31.5, 23.5))
     with open_recording(path, camera=SMALL) as recording:
         np.testing.assert_allclose(recording.frame(0).depth, STORED[0], atol=1e-3)
 
@@ -250,9 +250,9 @@ def test_a_realsense_recording_states_its_unit(
     [
         ("r.bag", b"hello", "something else"),
         ("r.bag", b"#ROSBAG V1.2\n" + bytes(99), "old ROS"),
-        ("r.bag", b"#ROSBAG V2.0\n", "holds no depth pictures"),
+        ("r.bag", b"#ROSBAG V2.0\n", "holds no depth images"),
         ("r.db3", b"", "is empty"),
-        ("r.db3", b"SQLite format 3\0" + bytes(5000), "holds no depth pictures"),
+        ("r.db3", b"SQLite format 3\0" + bytes(5000), "holds no depth images"),
     ],
 )
 def test_what_is_no_bag_is_told_in_a_sentence(
@@ -276,7 +276,7 @@ def test_log_times_are_whole_nanoseconds(write: Writer) -> None:
         assert recording.times_ns.tolist() == times
 
 
-# Sizes that cannot be, in every kind of message: no picture, and no memory asked for.
+# Sizes that cannot be, in every kind of message: no image, and no memory asked for.
 
 
 PIXELS = bytes(2 * 64 * 48)

@@ -1,4 +1,4 @@
-"""Depth videos of MoSeq sessions: FFV1 in AVI, raw pictures in Azure's Matroska, and the camera
+"""Depth videos of MoSeq sessions: FFV1 in AVI, raw images in Azure's Matroska, and the camera
 each comes from.
 """
 

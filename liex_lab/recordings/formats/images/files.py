@@ -136,7 +136,7 @@ def open_files(
     found: list[Probe] = []
     for path in files:
         found.append(probe(path))
-        progress(len(found), len(files), "looking at the pictures")
+        progress(len(found), len(files), "looking at the images")
     sizes = {size: path.name for path, size in zip(files, found, strict=True) if _is_size(size)}
     why = next((error for error in found if isinstance(error, RecordingError)), None)
     size = _common_size(sizes, files, kind, why)
@@ -160,20 +160,20 @@ def _common_size(
     if sizes:
         ((w, h), one), ((v, g), other) = list(sizes.items())[:2]
         raise RecordingError(
-            f"all pictures of a recording have one size, but {one} has {w} x {h} pixels and "
+            f"all images of a recording have one size, but {one} has {w} x {h} pixels and "
             f"{other} {v} x {g}; put them into two folders"
         )
     raise why or RecordingError(
-        f"none of the {len(files)} {kind} pictures in {files[0].parent} is whole; copy them again"
+        f"none of the {len(files)} {kind} images in {files[0].parent} is whole; copy them again"
         if len(files) > 1
-        else f"{files[0]} is cut short and holds no whole picture; copy it again"
+        else f"{files[0]} is cut short and holds no whole image; copy it again"
     )
 
 
 def something_else(path: Path | str, kind: str) -> RecordingError:
     """The error for a file whose first bytes do not match its kind, such as "PNG"."""
     return RecordingError(
-        f"{path} is named like a {kind} picture but holds something else; remove it or give it its "
+        f"{path} is named like a {kind} image but holds something else; remove it or give it its "
         "name"
     )
 
@@ -196,7 +196,7 @@ def not_depth_error(where: str, found: str, width: int, height: int) -> Recordin
     return RecordingError(
         f"expected 16-bit depth, got {article} {found} image of {width} x {height} pixels "
         f"({where}); give the camera's "
-        'depth pictures, or choose them with a line such as pattern = "*_depth.png" under '
+        'depth images, or choose them with a line such as pattern = "*_depth.png" under '
         "[camera] in camera.toml"
     )
 
@@ -232,11 +232,11 @@ def decode_png(data: NDArray[np.uint8], colour: bool = False) -> NDArray[Any] | 
     if not _sums_agree(data):  # the decoder would print a message to the terminal
         return None
     try:
-        picture: NDArray[Any] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        image: NDArray[Any] | None = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:  # an empty buffer, or a size beyond OpenCV's limits
         return None
     kind = (3, np.dtype(np.uint8)) if colour else (2, np.dtype(np.uint16))
-    return picture if picture is not None and (picture.ndim, picture.dtype) == kind else None
+    return image if image is not None and (image.ndim, image.dtype) == kind else None
 
 
 def _sums_agree(data: NDArray[np.uint8]) -> bool:
@@ -314,7 +314,7 @@ def png_size(head: bytes, where: str, colour: bool = False) -> Size | None:
         or too_large((width, height))
     ):
         raise RecordingError(
-            f"{where} begins like a PNG picture but its header makes no sense; remove it or copy "
+            f"{where} begins like a PNG image but its header makes no sense; remove it or copy "
             "it again"
         )
     if (bits, kind) != ((8, 2) if colour else (16, 0)):
@@ -460,22 +460,20 @@ def _decode_pclzf(path: Path) -> NDArray[np.uint16] | None:
     return out.view("<u2").reshape(height, width).astype(np.uint16) if whole else None
 
 
-def read_pclzf_camera(picture: Path) -> dict[str, float] | None:
+def read_pclzf_camera(image: Path) -> dict[str, float] | None:
     """Intrinsics and unit in the XML file of an image.
 
     PCL writes `frame_T.xml` next to `frame_T_depth.pclzf`, with two top-level elements, <rgb> and
     <depth>, so it is only valid XML inside another element.
 
     Args:
-        picture: the .pclzf file.
+        image: the .pclzf file.
 
     Returns:
         fx, fy, cx, cy (px) and unit_mm (mm per stored step) by name; None if there is no XML file
         with all of them.
     """
-    path = picture.with_name(
-        picture.name.removesuffix(picture.suffix).removesuffix("_depth") + ".xml"
-    )
+    path = image.with_name(image.name.removesuffix(image.suffix).removesuffix("_depth") + ".xml")
     if not path.is_file():
         return None
     with path.open("rb") as file:
@@ -642,12 +640,10 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
         n_whole = next((i for i, page in enumerate(found) if not page.whole), len(found))
         if n_whole and (n_whole < len(found) or not ends):
             # a stack ends at its first bad page: later ones may be noise
-            problems.append(
-                f"{path.name} is cut short: only its first {n_whole} pictures are whole"
-            )
+            problems.append(f"{path.name} is cut short: only its first {n_whole} images are whole")
             found = found[:n_whole]
         pages += found or [_Page(path, 0)]
-        progress(number, len(files), "looking at the pictures")
+        progress(number, len(files), "looking at the images")
     sizes = {page.size: page.path.name for page in reversed(pages) if page.whole}
     return TiffStack(pages, _common_size(sizes, files, "TIFF"), problems)
 

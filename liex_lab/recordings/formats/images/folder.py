@@ -82,7 +82,7 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
         (first, files), (second, _) = found[:2]
         one = f"*{files[0].suffix}"
         raise SeveralKindsError(
-            f"{folder} holds both {first} and {second} pictures, and a recording has one "
+            f"{folder} holds both {first} and {second} images, and a recording has one "
             f'kind; choose with a line such as pattern = "{one}" under [camera] in camera.toml',
             one,
         )
@@ -91,12 +91,12 @@ def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
     ]
     if not found and eight_bit:
         raise RecordingError(
-            "expected 16-bit depth pictures (PNG or TIFF), got 8-bit pictures such as "
-            f"{eight_bit[0].name} in {folder}; give the folder of the camera's depth pictures"
+            "expected 16-bit depth images (PNG or TIFF), got 8-bit images such as "
+            f"{eight_bit[0].name} in {folder}; give the folder of the camera's depth images"
         )
     if not found:
         raise RecordingError(
-            f"no picture in {folder} fits pattern = {pattern!r}; correct it in camera.toml"
+            f"no image in {folder} fits pattern = {pattern!r}; correct it in camera.toml"
         )
     kind, files = found[0]
     return kind, sorted(files, key=lambda path: natural_key(path.name))
@@ -179,7 +179,7 @@ def image_recording(
         cut = [i for i, whole in enumerate(stack.whole) if not whole]
         problems = [*camera_toml.problems, *stack.problems]
         problems += [
-            f"{len(cut)} of {len(stack)} pictures are cut short or damaged and were taken as "
+            f"{len(cut)} of {len(stack)} images are cut short or damaged and were taken as "
             f"wholly unread, the first is frame {first} ({stack.label(first)})"
             for first in cut[:1]
         ]
@@ -239,7 +239,7 @@ def _times(
         kept = np.flatnonzero(rows >= 0)
         if not len(kept):
             raise RecordingError(
-                f"{path} holds no time stamp; write one per picture, or remove it and state "
+                f"{path} holds no time stamp; write one per image, or remove it and state "
                 "fps in camera.toml"
             )
         return kept, times[rows[kept]], stamps.zoned
@@ -247,9 +247,9 @@ def _times(
         return kept, *named
     if hz is None:
         raise UnknownTimesError(
-            f"the times of the pictures in {folder} are not known; write "
+            f"the times of the images in {folder} are not known; write "
             f"{camera_toml.timestamps} with a line time_ns (or time_s) and then one time per "
-            "picture, or state a constant rate with fps = 30.0 under [camera] in camera.toml"
+            "image, or state a constant rate with fps = 30.0 under [camera] in camera.toml"
             + ("" if camera_toml.path.is_file() else f" ({WHAT_TO_WRITE})")
         )
     problems.append(f"there are no time stamps, so a constant {hz:g} frames/s was assumed")
@@ -272,7 +272,7 @@ def _with_xml(camera_file: CameraFile, image: Path) -> CameraFile:
         camera_file,
         intrinsics=found,
         unit_mm=camera_file.unit_mm if camera_file.path.is_file() else unit_mm,
-        source="the XML files beside the pictures",
+        source="the XML files beside the images",
     )
 
 
@@ -293,8 +293,8 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
     if camera_file.encoding == COLOUR:
         raise RecordingError(
             f'{camera_file.path} states encoding = "{COLOUR}", which is one of colour PNG '
-            "pictures, but "
-            f"{files[0].name} is a {kind} picture; correct it"
+            "images, but "
+            f"{files[0].name} is a {kind} image; correct it"
         )
     if kind == "PGM":
         return open_pgms(files, progress, camera_file.byte_order)

@@ -120,7 +120,7 @@ def _pictures(folder: Path, view: int) -> list[Path]:
     real = [path for path in files if path.name.startswith("depth")] or files
     if not real:
         raise RecordingError(
-            f"{folder} holds no pictures depth_{view}_0000001.png of the NYU data set; give "
+            f"{folder} holds no images depth_{view}_0000001.png of the NYU data set; give "
             "another folder"
         )
     return sorted(real, key=lambda path: natural_key(path.name))

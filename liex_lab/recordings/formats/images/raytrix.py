@@ -346,7 +346,7 @@ def _check(stack: Stack, profile: Profile, path: Path) -> None:
         return
     if stored.dtype != np.dtype(profile.stored):
         raise RecordingError(
-            f"the profile {profile.name!r} is for {profile.stored} pictures, but "
+            f"the profile {profile.name!r} is for {profile.stored} images, but "
             f"{stack.label(first)} is {stored.dtype.name}; choose another profile in {path}, or "
             "change stored"
         )

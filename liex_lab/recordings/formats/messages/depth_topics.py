@@ -35,7 +35,7 @@ from liex_lab.recordings.formats.messages.messages import (
     DamagedMessage,
     DepthMessage,
     Envelope,
-    Listed,
+    IndexedMessages,
     MessageFile,
     MessagePlace,
     Parser,
@@ -120,7 +120,7 @@ class _Topic:
         sent_ns = min(message.publish_time_ns, _LIMIT_NS)
         self.rows.extend((message.log_time_ns, sent_ns, stamp_ns, *message.place))
 
-    def add_all(self, listed: Listed) -> None:
+    def add_all(self, listed: IndexedMessages) -> None:
         """Record messages listed by an index.
 
         Args:
@@ -301,7 +301,7 @@ def _open(
     doubts: list[str] = []
     if not file.whole:
         problems.append(
-            f"{path.name} is cut or damaged; {len(chosen.rows) // 6} whole depth pictures can be "
+            f"{path.name} is cut or damaged; {len(chosen.rows) // 6} whole depth images can be "
             "read from it"
         )
     the_camera = _camera(path, chosen, found, camera_file, camera, file.notes, problems, doubts)
@@ -371,7 +371,7 @@ def _stamps(
     steps, sent_steps = np.diff(logged), np.diff(sent)
     is_even = len(steps) > 1 and sent_steps.min() > 0 and 2.0 * sent_steps.std() < steps.std()
     problems.append(
-        f"{unstamped} of {len(stamps)} pictures have no stamp of the sensor, so the times of "
+        f"{unstamped} of {len(stamps)} images have no stamp of the sensor, so the times of "
         f"{'sending' if is_even else 'logging'} are used"
     )
     return sent if is_even else logged
@@ -386,7 +386,7 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
             parsers[channel] = parser_of(channel)
         return parsers[channel] is not None
 
-    def take(message: Envelope | Listed) -> None:
+    def take(message: Envelope | IndexedMessages) -> None:
         parse = parsers[message.channel]
         assert parse is not None
         try:
@@ -406,10 +406,10 @@ def _walk(file: MessageFile, found: _Found, progress: Progress) -> None:
     file.whole = file.whole and not found.failed.keys() & found.read
 
 
-def _note(found: _Found, envelope: Envelope | Listed, parse: Parser) -> bool:
+def _note(found: _Found, envelope: Envelope | IndexedMessages, parse: Parser) -> bool:
     """Record a message; False if its channel is not depth, or if further messages add nothing."""
     channel = envelope.channel
-    if isinstance(envelope, Listed):
+    if isinstance(envelope, IndexedMessages):
         if channel in found.depths:
             found.depths[channel].add_all(envelope)
         elif channel.topic in found.calibrations and len(envelope.places):
@@ -450,16 +450,16 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
             if depth.name == topic:
                 return depth
         offer = f"the depth topics are {names}" if names else "there is no depth topic in it"
-        raise RecordingError(f"{path} has no depth pictures on the topic {topic!r}; {offer}")
-    pictures = [depth for depth in depths if plain_schema(depth.channel) not in CLOUD_SCHEMAS]
-    visible = [depth for depth in pictures if not is_infrared(depth.name)]
-    for some in (visible, pictures, depths):
+        raise RecordingError(f"{path} has no depth images on the topic {topic!r}; {offer}")
+    images = [depth for depth in depths if plain_schema(depth.channel) not in CLOUD_SCHEMAS]
+    visible = [depth for depth in images if not is_infrared(depth.name)]
+    for some in (visible, images, depths):
         if len(some) == 1:
             return some[0]
         if some:
             choice = sorted(printable(depth.name) for depth in some)
             raise RecordingError(
-                f"{path} holds depth pictures on {len(some)} topics, {', '.join(choice)}; choose "
+                f"{path} holds depth images on {len(some)} topics, {', '.join(choice)}; choose "
                 f"one with --topic {choice[0]} (in Python topic=), or in a plan with "
                 "recording.topic"
             )
@@ -477,7 +477,7 @@ def _no_depth(file: MessageFile, found: _Found) -> RecordingError:
     jpeg = any("jp" in kind.lower() for kind in found.kinds.values())
     lossy = "; JPEG does not keep depth, so record the raw or the compressedDepth topic"
     return RecordingError(
-        f"{file.path} holds no depth pictures: {cut}its topics are {listed or 'none'}; {_EXPECTED}"
+        f"{file.path} holds no depth images: {cut}its topics are {listed or 'none'}; {_EXPECTED}"
         + (lossy if jpeg else "")
     )
 
@@ -509,9 +509,9 @@ def _camera(
     size = _size(topic, (known[0] or 0, known[1] or 0))
     if not min(size):
         raise RecordingError(
-            f"{path} holds points that lie in no picture on {printable(topic.name)}; write a "
+            f"{path} holds points that lie in no image on {printable(topic.name)}; write a "
             "camera.toml beside it with [camera], width = ... and height = ... in pixels, to say "
-            "which picture they are seen in"
+            "which image they are seen in"
         )
     return camera_file.camera(*size, stated)
 

@@ -43,7 +43,7 @@ from liex_lab.recordings.formats.messages.messages import (
     Chunk,
     DamagedChunk,
     Envelope,
-    Listed,
+    IndexedMessages,
     MessageFile,
     MessagePlace,
     unpacked,
@@ -78,7 +78,7 @@ DAMAGE = (
     EOFError,
 )
 
-Wanted = Callable[[Channel], bool]
+IsRelevant = Callable[[Channel], bool]
 
 
 def open_mcap(
@@ -177,7 +177,7 @@ class McapFile(MessageFile):
         self._last_chunk = (-1, memoryview(b""))
         return n_chunks
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
+    def walk(self, wanted: IsRelevant, progress: Progress) -> Iterator[Envelope | IndexedMessages]:
         """Every whole message of the wanted channels, in file order.
 
         A second walk begins after the last whole record of the first.
@@ -198,7 +198,7 @@ class McapFile(MessageFile):
                 self._coming.clear()
 
     def _walk(
-        self, wanted: Wanted, progress: Progress, unpackers: ThreadPoolExecutor
+        self, wanted: IsRelevant, progress: Progress, unpackers: ThreadPoolExecutor
     ) -> Iterator[Envelope]:
         at = self._sure[0]
         footer = False
@@ -285,7 +285,7 @@ class McapFile(MessageFile):
             start = start + len(block)
         return crc
 
-    def _walk_chunk(self, start: int, length: int, wanted: Wanted) -> Iterator[Envelope]:
+    def _walk_chunk(self, start: int, length: int, wanted: IsRelevant) -> Iterator[Envelope]:
         number = len(self.chunks)
         try:
             self.chunks.append(self._chunk(start, length))
@@ -323,7 +323,7 @@ class McapFile(MessageFile):
         return Chunk(offset, min(n_packed, end - offset), packing, size, crc, cut)
 
     def _take(
-        self, opcode: int, payload: memoryview, place: MessagePlace, wanted: Wanted
+        self, opcode: int, payload: memoryview, place: MessagePlace, wanted: IsRelevant
     ) -> Iterator[Envelope]:
         try:
             if opcode == Opcode.MESSAGE:
@@ -387,7 +387,7 @@ class IndexedMcap(McapFile):
         super().__init__(path, file)
         self._is_replay = is_replay
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope | Listed]:
+    def walk(self, wanted: IsRelevant, progress: Progress) -> Iterator[Envelope | IndexedMessages]:
         """The messages of the wanted channels, by channel: the first of each with its data."""
         self._learn_ending()
         try:
@@ -400,7 +400,7 @@ class IndexedMcap(McapFile):
         for channel_id, those in tables.items():
             yield from self._messages(channel_id, those, wanted)
 
-    def _tables(self, wanted: Wanted, progress: Progress) -> dict[int, list[_Table]]:
+    def _tables(self, wanted: IsRelevant, progress: Progress) -> dict[int, list[_Table]]:
         """Contents of the message indexes of all chunks, by channel.
 
         Raises:
@@ -439,14 +439,14 @@ class IndexedMcap(McapFile):
         return tables
 
     def _messages(
-        self, channel_id: int, tables: Sequence[_Table], wanted: Wanted
-    ) -> Iterator[Envelope | Listed]:
+        self, channel_id: int, tables: Sequence[_Table], wanted: IsRelevant
+    ) -> Iterator[Envelope | IndexedMessages]:
         """One channel's messages: the first with its data, and the rest listed if possible."""
         channel = self._by_id[channel_id]
         listed = _listed(channel, tables)
         n_stated = sum(len(entries) for _, entries in tables) // _ENTRY.itemsize
         self.whole &= len(listed.places) == n_stated
-        rest: Listed | None = None
+        rest: IndexedMessages | None = None
         tried = False
         for k, (time_ns, numbers) in enumerate(
             zip(listed.log_time_ns.tolist(), listed.places.tolist(), strict=True)
@@ -463,13 +463,15 @@ class IndexedMcap(McapFile):
                 continue
             yield Envelope(channel, time_ns, place, data, sent_ns)
             if not tried:
-                later = Listed(channel, listed.log_time_ns[k + 1 :], listed.places[k + 1 :])
+                later = IndexedMessages(
+                    channel, listed.log_time_ns[k + 1 :], listed.places[k + 1 :]
+                )
                 tried, rest = True, self._stamped(channel_id, later)
             if rest is not None:
                 yield rest
                 return
 
-    def _stamped(self, channel_id: int, listed: Listed) -> Listed | None:
+    def _stamped(self, channel_id: int, listed: IndexedMessages) -> IndexedMessages | None:
         """Messages with the sensor's stamps; None if reading these needs whole messages."""
         channel = listed.channel
         if self._is_replay or plain_schema(channel) in CALIBRATION_SCHEMAS:
@@ -489,7 +491,7 @@ class IndexedMcap(McapFile):
         good = table[:, 0] == 1
         self.whole = self.whole and bool(good.all())
         sent_ns = table[good, 2].view(np.uint64)
-        return Listed(
+        return IndexedMessages(
             channel, listed.log_time_ns[good], listed.places[good], table[good, 1], sent_ns
         )
 
@@ -563,7 +565,7 @@ class IndexedMcap(McapFile):
         return data[begin + MESSAGE.size : begin + length]
 
 
-def _listed(channel: Channel, tables: Sequence[_Table]) -> Listed:
+def _listed(channel: Channel, tables: Sequence[_Table]) -> IndexedMessages:
     """Messages of a channel in file order, without those with invalid offsets.
 
     An hour has sixteen thousand chunks, so their tables are parsed as one.
@@ -576,4 +578,4 @@ def _listed(channel: Channel, tables: Sequence[_Table]) -> Listed:
     places = np.full((len(order), 3), _UNKNOWN, np.int64)
     places[:, 0] = number[order]
     places[:, 1] = table["offset"][order]
-    return Listed(channel, table["time_ns"][order], places)
+    return IndexedMessages(channel, table["time_ns"][order], places)

@@ -211,7 +211,7 @@ class Envelope(NamedTuple):
     publish_time_ns: int = 0
 
 
-class Listed(NamedTuple):
+class IndexedMessages(NamedTuple):
     """Messages listed by an index, and read on demand.
 
     Attributes:
@@ -285,7 +285,7 @@ class MessageFile(ABC):
     @abstractmethod
     def walk(
         self, wanted: Callable[[Channel], bool], progress: Progress
-    ) -> Iterator[Envelope | Listed]:
+    ) -> Iterator[Envelope | IndexedMessages]:
         """Every whole message of the wanted channels, in file order.
 
         Args:

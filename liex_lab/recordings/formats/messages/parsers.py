@@ -407,7 +407,7 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
     else:
         is_rvl, body = _unwrapped(message)
         try:
-            found = _RVL_SIZE.unpack_from(body) if is_rvl else png_size(bytes(body[:26]), "picture")
+            found = _RVL_SIZE.unpack_from(body) if is_rvl else png_size(bytes(body[:26]), "image")
         except (RecordingError, struct.error):
             return None  # a colour PNG is not depth
     fits = found is not None and min(found) > 0 and found[0] * found[1] <= LARGEST_PICTURE

@@ -27,7 +27,7 @@ from liex_lab.recordings.formats.messages.messages import (
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 
-Wanted = Callable[[Channel], bool]
+IsRelevant = Callable[[Channel], bool]
 
 _MAGIC = b"#ROSBAG V"
 _VERSION = b"#ROSBAG V2.0\n"
@@ -87,7 +87,7 @@ class BagFile(MessageFile):
         super().__init__(path, file)
         self._by_id: dict[int, Channel] = {}
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
+    def walk(self, wanted: IsRelevant, progress: Progress) -> Iterator[Envelope]:
         """Every whole message of the wanted channels, in file order.
 
         Args:
@@ -170,7 +170,7 @@ class BagFile(MessageFile):
         return indexed
 
     def _walk_chunk(
-        self, header: dict[str, bytes], begin: int, end: int, wanted: Wanted
+        self, header: dict[str, bytes], begin: int, end: int, wanted: IsRelevant
     ) -> Iterator[Envelope]:
         cut = end > self.size
         (size,) = _U32.unpack(header["size"])
@@ -200,7 +200,7 @@ class BagFile(MessageFile):
         header: dict[str, bytes],
         data: memoryview,
         place: MessagePlace,
-        wanted: Wanted,
+        wanted: IsRelevant,
     ) -> Iterator[Envelope]:
         """Record a connection, or yield a message."""
         if opcode == _CONNECTION:
@@ -246,7 +246,7 @@ class Db3File(MessageFile):
         uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
         self._base = sqlite3.connect(uri, uri=True, check_same_thread=False)
 
-    def walk(self, wanted: Wanted, progress: Progress) -> Iterator[Envelope]:
+    def walk(self, wanted: IsRelevant, progress: Progress) -> Iterator[Envelope]:
         """Every message of the wanted channels, in the order in which they were stored.
 
         Args:
