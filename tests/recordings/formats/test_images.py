@@ -183,15 +183,15 @@ def test_a_single_cut_picture_is_refused(tmp_path: Path) -> None:
 )
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
 def test_pictures_for_people_are_refused(
-    tmp_path: Path, picture: np.ndarray, kind: str, suffix: str
+    tmp_path: Path, image: np.ndarray, kind: str, suffix: str
 ) -> None:
     folder = tmp_path / "r"
     write_camera_folder = write_png_folder(folder, STORED[:0])
     path = folder / f"a{suffix}"
     if suffix == ".png":
-        cv2.imwrite(str(path), picture)
+        cv2.imwrite(str(path), image)
     else:
-        tifffile.imwrite(path, picture, photometric="minisblack" if picture.ndim == 2 else "rgb")
+        tifffile.imwrite(path, image, photometric="minisblack" if image.ndim == 2 else "rgb")
         kind = kind.replace(" with transparency", "").replace(
             "a 16-bit", "a 16-bit unsigned integer"
         )
