@@ -79,16 +79,15 @@ def growing(reopen: Callable[[], Recording], patience_s: float) -> Arriving:
 
 def _when_there(reopen: Callable[[], Recording], patience_s: float) -> Recording:
     """The recording, opened as soon as it has a first frame."""
-    began = time.perf_counter()
+    by = time.perf_counter() + patience_s
     while True:
         try:
-            opened = reopen()
-            if len(opened):
+            if len(opened := reopen()):
                 return opened
         except RecordingError:
-            if time.perf_counter() - began > patience_s:
+            if time.perf_counter() > by:
                 raise
-        if time.perf_counter() - began > patience_s:
+        if time.perf_counter() > by:
             raise RecordingError(
                 f"nothing has come for {patience_s:g} s; begin the recording first, or wait longer"
             )

@@ -761,7 +761,9 @@ class _Session:
 
     def _open_raw(self, once: bool) -> RawFrames:
         n_bytes = self.depth.stat().st_size
-        width, height = self.metadata.size or self._size_of_camera() or self._guess_size(n_bytes)
+        camera = self.stated_camera if isinstance(self.stated_camera, Camera) else self.camera_file
+        stated = (camera.width, camera.height) if camera.width and camera.height else None
+        width, height = self.metadata.size or stated or self._guess_size(n_bytes)
         n, left_over = divmod(n_bytes, 2 * width * height)
         if not n:
             raise RecordingError(
@@ -778,10 +780,6 @@ class _Session:
             )
         cut = bool(left_over) or self.cut
         return RawFrames(self.depth, (width, height), self.metadata.dtype, n, cut, once)
-
-    def _size_of_camera(self) -> tuple[int, int] | None:
-        stated = self.stated_camera if isinstance(self.stated_camera, Camera) else self.camera_file
-        return (stated.width, stated.height) if stated.width and stated.height else None
 
     def _guess_size(self, n_bytes: int) -> tuple[int, int]:
         """The size of a Kinect v2; an error if the stamps only match another camera's size."""

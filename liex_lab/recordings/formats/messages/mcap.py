@@ -375,7 +375,6 @@ _ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 _HEAD = 512  # first bytes of a message's record, with its stamp
 _BATCH = 32  # chunks per task of unpacking
 
-_StampReader = Callable[[memoryview], int | None]
 _Table = tuple[int, bytes]  # number of a chunk, and times and offsets of messages as written
 
 
@@ -481,13 +480,16 @@ class IndexedMcap(McapFile):
             return None
         by_chunk = np.flatnonzero(np.diff(listed.places[:, 0])) + 1
         edges = [0, *by_chunk[_BATCH - 1 :: _BATCH].tolist(), len(listed.places)]
-        parts = [listed.places[a:b] for a, b in itertools.pairwise(edges)]
-        logged = [listed.log_time_ns[a:b] for a, b in itertools.pairwise(edges)]
+        parts = (
+            IndexedMessages(channel, listed.log_time_ns[a:b], listed.places[a:b])
+            for a, b in itertools.pairwise(edges)
+        )
         with ThreadPoolExecutor(THREADS) as unpackers:
-            found = list(unpackers.map(partial(self._stamps, read, channel_id), parts, logged))
-        if not all(one is not None for one in found):
+            found = list(unpackers.map(partial(self._stamps, read, channel_id), parts))
+        known = [one for one in found if one is not None]
+        if len(known) < len(found):
             return None
-        table = np.concatenate([one for one in found if one is not None])
+        table = np.concatenate(known)
         good = table[:, 0] == 1
         self.whole = self.whole and bool(good.all())
         sent_ns = table[good, 2].view(np.uint64)
@@ -497,15 +499,15 @@ class IndexedMcap(McapFile):
 
     def _stamps(
         self,
-        read: _StampReader,
+        read: Callable[[memoryview], int | None],
         channel_id: int,
-        places: NDArray[np.int64],
-        logged_ns: NDArray[np.uint64],
+        listed: IndexedMessages,
     ) -> NDArray[np.int64] | None:
         """(n, 3) for each message whether it could be read, its stamp and its time of sending, ns.
 
         None if the beginnings of messages do not contain their stamps.
         """
+        places = listed.places
         table = np.zeros((len(places), 3), np.int64)
         with self.path.open("rb") as file:  # threads need separate file positions
             for rows in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places[:, 0])) + 1):
@@ -521,7 +523,11 @@ class IndexedMcap(McapFile):
                     for row, head in zip(rows.tolist(), heads, strict=True):
                         opcode, length = RECORD.unpack_from(head)
                         whose, _, log_ns, sent_ns = MESSAGE.unpack_from(head, RECORD.size)
-                        if (opcode, whose, log_ns) != (Opcode.MESSAGE, channel_id, logged_ns[row]):
+                        if (opcode, whose, log_ns) != (
+                            Opcode.MESSAGE,
+                            channel_id,
+                            listed.log_time_ns[row],
+                        ):
                             raise DamagedChunk("there is another message than its index says")
                         begin = RECORD.size + MESSAGE.size
                         stamp_ns = read(memoryview(head)[begin : RECORD.size + length])
@@ -542,7 +548,7 @@ class IndexedMcap(McapFile):
             return super().read(place)
         try:
             return self._message(place)
-        except DamagedChunk as error:
+        except (DamagedChunk, struct.error) as error:
             advice = (
                 "run `liex run` on its recording"
                 if self._is_replay
@@ -555,10 +561,7 @@ class IndexedMcap(McapFile):
     def _message(self, place: MessagePlace) -> memoryview:
         """The data of a message whose length is only stated in its chunk."""
         data = self.unpack(place.chunk)
-        try:
-            opcode, length = RECORD.unpack_from(data, place.offset)
-        except struct.error:
-            opcode, length = 0, 0
+        opcode, length = RECORD.unpack_from(data, place.offset)
         begin = place.offset + RECORD.size
         if opcode != Opcode.MESSAGE or not MESSAGE.size <= length <= len(data) - begin:
             raise DamagedChunk("there is no message where its index says")
