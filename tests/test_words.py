@@ -28,7 +28,7 @@ LIMITS = {
     "tells?": 82,
     "seen": 783,
     "said": 188,
-    "says?": 202,
+    "says?": 199,
     "whom?": 70,
     "looks?": 169,
     "looked": 24,

@@ -411,7 +411,7 @@ class IndexedMcap(McapFile):
             at = index.chunk_start_offset
             opcode, start, end = self._record(at)
             if (opcode, end - at) != (Opcode.CHUNK, index.chunk_length):
-                raise DamagedChunk("there is no chunk where its index says")
+                raise DamagedChunk("its index names no chunk")
             self.chunks.append(self._chunk(start, end - start))
             offsets = index.message_index_offsets
             first = min(offsets.values(), default=0)
@@ -528,7 +528,7 @@ class IndexedMcap(McapFile):
                             channel_id,
                             listed.log_time_ns[row],
                         ):
-                            raise DamagedChunk("there is another message than its index says")
+                            raise DamagedChunk("there is another message than in its index")
                         begin = RECORD.size + MESSAGE.size
                         stamp_ns = read(memoryview(head)[begin : RECORD.size + length])
                         if stamp_ns is None:
@@ -564,7 +564,7 @@ class IndexedMcap(McapFile):
         opcode, length = RECORD.unpack_from(data, place.offset)
         begin = place.offset + RECORD.size
         if opcode != Opcode.MESSAGE or not MESSAGE.size <= length <= len(data) - begin:
-            raise DamagedChunk("there is no message where its index says")
+            raise DamagedChunk("its index names no message")
         return data[begin + MESSAGE.size : begin + length]
 
 
