@@ -8,7 +8,7 @@ and prediction give the same bits on any number of cores.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,13 @@ class Network:
     centre: NDArray[np.float32]
     scale: NDArray[np.float32]
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+
+    @staticmethod
+    def plain(layers: Iterable[Sequence[NDArray[np.float32]]]) -> Network:
+        """A network of these layers whose features are not standardised."""
+        packed = tuple((weights, bias) for weights, bias in layers)
+        n = len(packed[0][0])
+        return Network(np.zeros(n, np.float32), np.ones(n, np.float32), packed)
 
     def logits(self, features: NDArray[np.floating]) -> Array:
         """Logits of samples, identical on any number of cores, unlike products of threaded BLAS.

@@ -56,9 +56,9 @@ from liex_lab.sessions.rrd import ReplayWriter
 from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, frame_count
-from liex_lab.tracking.following import let_follow
+from liex_lab.tracking.curve import MARGIN, track_whole
 from liex_lab.tracking.observations import reversed_pose
-from liex_lab.tracking.offline import MARGIN, track_whole
+from liex_lab.tracking.smoother import let_follow
 from liex_lab.tracking.track import COLUMNS, CORRECTED, Flip, Track, ends_of
 
 from .session import measure_behaviour

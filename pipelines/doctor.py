@@ -45,7 +45,7 @@ from liex_lab.scene.background import has_noise, sample_frames, sampled, stride_
 from liex_lab.scene.scene import Arena, Fixture
 from liex_lab.scene.zones import masks_apart
 from liex_lab.sessions.folder import megabytes
-from liex_lab.tracking.offline import copies_told
+from liex_lab.tracking.curve import repeat_messages
 
 from .build import build_water, open_planned
 from .choice import USUAL, Proposal, propose_plan
@@ -318,7 +318,7 @@ def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]
     ]
     times_ns, repeats = (np.array(column) for column in zip(*compared, strict=True))
     some = f", of {len(compared):,} frames compared" if len(compared) < n else ""
-    found = copies_told(times_ns, repeats, has_noise(sample))
+    found = repeat_messages(times_ns, repeats, has_noise(sample))
     return [f"{told}{some}" for part in found for told in part]
 
 

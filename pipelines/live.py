@@ -85,8 +85,8 @@ def follow_live(
         RecordingError: the recording ended before its first frame.
         EstimationError: no animal is found in the frames that are learned from.
     """
+    from liex_lab.tracking.curve import OnlineTracker
     from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.online import OnlineTracker
 
     frames = arriving.frames
     held = list(islice(frames, learn_frames))

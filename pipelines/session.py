@@ -378,8 +378,8 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     """
     from liex_lab.optics.camera import unusual_centre, unusual_lens
     from liex_lab.sessions.verdict import Verdict
+    from liex_lab.tracking.curve import repeat_messages
     from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.offline import copies_told
     from liex_lab.tracking.trust import why_too_fast
 
     tracker = fitted.tracker
@@ -388,7 +388,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     subject = tracker.subject
     recording = fitted.recording
     fast = why_too_fast(tracked.track, subject.length_mm)
-    frozen, copied = copies_told(whole.times_ns, whole.repeats, tracker.noisy)
+    frozen, copied = repeat_messages(whole.times_ns, whole.repeats, tracker.noisy)
     water = build_water(fitted.plan)
     # with water the ideal camera has another focal length
     lens = unusual_lens(recording.camera) if water is None else ""

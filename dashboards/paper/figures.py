@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from liex_lab.evaluation.scores import Followed, Individual
+from liex_lab.evaluation.scores import Followed, MeasuredIndividual
 from liex_lab.recordings.formats.images.nyu import POINTS
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.scenes.recording import TrueAnimal
@@ -476,7 +476,7 @@ def draw_scene(
     name: str,
     recording: TrueRecording,
     truths: Sequence[TrueAnimal],
-    individuals: Sequence[Individual],
+    individuals: Sequence[MeasuredIndividual],
     folder: Path,
 ) -> Path:
     """Frames of a scene with true and measured skeletons: the whole depth image, and a close-up.

@@ -245,7 +245,7 @@ def unfold(values, levers, place, heading, tree, rotations, positions):
     """Joint frames of the pose at F2's coordinates, relative to F1's position and heading.
 
     Args:
-        values: (D,) coordinates in lever units, see `baselines.forest.levers`.
+        values: (D,) coordinates in lever units, see `baselines.baseline.levers`.
         levers: (D,) lever arms.
         place: (3,) base position from F1, mm.
         heading: heading from F1, rad.

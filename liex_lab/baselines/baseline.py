@@ -9,31 +9,56 @@ start_seed=k)`, with one initial pose drawn from the seed k.
 
 All baselines of Lie-X section 5.2 use liex_lab's segmentation, so that only the pose estimation
 differs.
+
+The paper's RF baseline is a two-stage regression forest (F1 position and heading, F2 pose).
+Lie-X section 5.2: "Two separate regression forests, F1 and F2 [...]. F1 is used to estimate the 3D
+location and in-plane orientation of the subject, followed by F2 which produces a set of 3D pose
+candidates", 7 and 12 trees of depth 20, on the depth invariant two-point features of Shotton et al.
+(2013). The paper leaves the rest open; the choices here are:
+
+- F1 is evaluated at `n_points` pixels spread over the animal. Each leaf votes for the offset from
+  the pixel to the base joint and for the heading (Hough voting). The heading is the one that most
+  votes agree on, the position the mean-shift mode of the votes that agree with that heading.
+- F2 is evaluated once, at F1's position, its offsets turned by F1's heading. Each tree gives one
+  pose candidate in the skeleton's own coordinates, so bones keep their proportions; the result is
+  the mean-shift mode of the candidates.
+- Offsets reach as far as the animal is long. In half of the tests tried the second of the two
+  points is the pixel itself, as in Shotton's forests.
+- F2 learns from the estimates of those F1 trees that were not grown on the image, and only from
+  estimates that do not mistake the tail for the head.
+- F2's coordinates are relative to the home pose as the camera usually observes the animal: a hand
+  that shows its palm is turned by pi from one that lies like a mouse.
 """
 
 from __future__ import annotations
 
+import io
 import zipfile
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.baselines import _kernels as kernels
+from liex_lab.body.kinematics import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import ModelError
+from liex_lab.estimation.cascade import TrainingSet
 from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.training import ProgressCallback
+from liex_lab.forests._kernels import VIEW
+from liex_lab.forests.forest import Forest, Samples, check_forest
+from liex_lab.forests.grow import GrowthPlan, grow_forest
+from liex_lab.geometry import SE3, so3
+from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, in_camera_frame
 
 Array = NDArray[np.float64]
 
-DAMAGE = (
-    OSError,
-    ValueError,
-    LookupError,
-    EOFError,
-    RuntimeError,
-    zipfile.BadZipFile,
-)  # exceptions that a broken .npz raises
+# exceptions that a broken .npz raises
+DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True)
@@ -51,16 +76,16 @@ class Guesses:
     crops: HeightMaps
 
 
-class Baseline(Protocol):
-    """A pose estimator from the literature that uses liex_lab's segmentation."""
+class Baseline:
+    """A pose estimator from the literature that uses liex_lab's segmentation.
 
-    @property
-    def skeleton(self) -> Skeleton:
-        """The animal's skeleton."""
+    Attributes:
+        skeleton: the animal's skeleton.
+        takes_size: whether it uses the animal's size; the paper's baselines treat all sizes alike.
+    """
 
-    @property
-    def takes_size(self) -> bool:
-        """Whether it uses the animal's size; otherwise it treats all sizes alike."""
+    skeleton: Skeleton
+    takes_size = False
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames.
@@ -70,14 +95,16 @@ class Baseline(Protocol):
             scene: the segmenter fitted to the recording.
 
         Returns:
-            The animal's spine over the home length; 1 if the baseline has no notion of size, as the
-            paper's.
+            The animal's spine over the home length; 1 if the baseline has no notion of size.
         """
+        return 1.0
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> Guesses:
-        """Estimate the joints in each frame.
+        """Estimate the joints in each frame, of the component chosen by area and volume.
+
+        Heights are measured along the optical axis.
 
         Args:
             depths: (n, H, W) float32 mm, 0 where unread.
@@ -88,6 +115,9 @@ class Baseline(Protocol):
         Returns:
             The joints in the camera frame.
         """
+        second = second_is_likelier(depths, scene, parallel)
+        cut = chosen(depths, scene, size if self.takes_size else 1.0, second, True, parallel)
+        return self.guesses(*cut, size, parallel)
 
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
@@ -103,31 +133,7 @@ class Baseline(Protocol):
         Returns:
             The joints in the camera frame.
         """
-
-
-class Sizeless:
-    """A baseline without a notion of size, like the paper's: it treats all sizes alike."""
-
-    takes_size = False
-
-    def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
-        """Always 1."""
-        return 1.0
-
-    def estimate(
-        self: Baseline,
-        depths: NDArray[np.float32],
-        scene: Segmenter,
-        size: float,
-        parallel: bool = True,
-    ) -> Guesses:
-        """Estimate the joints in each frame, of the component chosen by area and volume.
-
-        Heights are measured along the optical axis.
-        """
-        second = second_is_likelier(depths, scene, parallel)
-        cut = chosen(depths, scene, 1.0, second, True, parallel)
-        return self.guesses(*cut, size, parallel)
+        raise NotImplementedError
 
 
 def second_is_likelier(
@@ -146,14 +152,11 @@ def second_is_likelier(
     Returns:
         (n,) bool, whether the second one is chosen.
     """
-    likelier = np.zeros(len(depths), np.bool_)
-    n_blobs = scene.extract_both(depths, 1.0, parallel, camera_view=True)[0].n_blobs
-    unsure = np.flatnonzero(n_blobs > 1)
+    likelier = scene.extract_both(depths, 1.0, parallel, camera_view=True)[0].n_blobs > 1
+    unsure = np.flatnonzero(likelier)
     if len(unsure):
-        first, second = (
-            scene.misfit(above_floor)
-            for above_floor in scene.extract_both(depths[unsure], 1.0, parallel)
-        )
+        above_floor = scene.extract_both(depths[unsure], 1.0, parallel)
+        first, second = (scene.misfit(crops) for crops in above_floor)
         likelier[unsure] = second < first
     return likelier
 
@@ -186,51 +189,313 @@ def chosen(
     return crops, scene.crop_cameras(crops, camera_view)
 
 
-@dataclass(frozen=True)
-class PlainMean:
+class PlainMean(Baseline):
     """The paper's variant that averages all of its candidates, without the learned metric.
 
-    They are averaged "for each of the joints in the 3D Euclidean space".
+    They are averaged "for each of the joints in the 3D Euclidean space"; bones do not keep their
+    lengths.
     """
 
-    estimator: PoseEstimator
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The animal's skeleton."""
-        return self.estimator.skeleton
-
-    @property
-    def takes_size(self) -> bool:
-        """Whether the estimator uses the animal's size."""
-        return self.estimator.model.method.session_size
+    def __init__(self, estimator: PoseEstimator) -> None:
+        self.estimator = estimator
+        self.skeleton = estimator.skeleton
+        self.takes_size = estimator.model.method.session_size
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Size of the animal over home size, estimated from a sample (n, H, W) of frames, mm."""
         return self.estimator.find_size(sample, scene)
 
-    def estimate(
-        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
+    def guesses(
+        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> Guesses:
-        """Average each joint's position over all candidates.
+        """Average each joint's position over all candidates, see `Baseline.guesses`."""
+        found = self.estimator.candidates(crops, crop_cameras, size, parallel)
+        joints = in_camera_frame(found.positions.mean(axis=1), crop_cameras)
+        joints[~crops.found] = np.nan
+        return Guesses(joints, crops.found, crops)
 
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter fitted to the recording.
-            size: the animal's size over home size.
-            parallel: use all cores rather than one.
 
-        Returns:
-            The joints in the camera frame; bones do not keep their lengths.
-        """
-        second = second_is_likelier(depths, scene, parallel)
-        return self.guesses(*chosen(depths, scene, size, second, True, parallel), size, parallel)
+# Two-stage regression forest.
+
+
+_F1 = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
+_F2 = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
+_N_WHERE = 5  # length of a leaf vector of F1
+# of the animal's length: a rotation about its own axis moves no joint of a straight animal
+_LEAST_LEVER = 0.05
+
+
+@dataclass(frozen=True)
+class ForestPlan:
+    """How the two forests grow and vote.
+
+    Attributes:
+        where: plan of F1.
+        pose: plan of F2.
+        training_points: pixels per image that F1 learns from.
+        n_points: pixels per image at which F1 is evaluated.
+        draws: samples of each image for F2, from different pixels.
+        bandwidths: (2,) bandwidths of the modes of F1 and F2, in units of the animal's length.
+        home_turn: (3,) rotation vector, rad, from the home pose to the animal as usually observed,
+            see `Method`.
+    """
+
+    where: GrowthPlan = _F1
+    pose: GrowthPlan = _F2
+    training_points: int = 16
+    n_points: int = 32
+    draws: int = 2
+    bandwidths: tuple[float, float] = (0.15, 0.25)
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class RegressionForest(Baseline):
+    """The trained pair of forests.
+
+    Attributes:
+        skeleton: the animal's skeleton.
+        plan: how the forests grew and vote.
+        where: F1; leaves (5,): offset to the base joint, mm, and heading (cosine, sine) times half
+            the animal's length.
+        pose: F2; leaves (D,): skeleton coordinates in lever units, see `levers`.
+    """
+
+    skeleton: Skeleton
+    plan: ForestPlan
+    where: Forest
+    pose: Forest
+
+    def __post_init__(self) -> None:
+        """Refuse forests that do not match their samples, since kernels do not check bounds."""
+        n_coordinates = len(levers(self.skeleton))
+        for name, forest, n in (("F1", self.where, _N_WHERE), ("F2", self.pose, n_coordinates)):
+            try:
+                check_forest(forest, 1, 0, n)
+            except ValueError as error:
+                raise ValueError(f"{name} of a regression forest cannot be used: {error}") from None
 
     def guesses(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
     ) -> Guesses:
-        """Estimate the joints of objects that are already cut out, see `Baseline.guesses`."""
-        _, positions, _, _ = self.estimator.candidates(crops, crop_cameras, size, parallel)
-        joints = in_camera_frame(positions.mean(axis=1), crop_cameras)
-        joints[~crops.found] = np.nan
-        return Guesses(joints, crops.found, crops)
+        """Estimate the joints of objects that are already cut out, see `Baseline.guesses`.
+
+        `size` is not used.
+        """
+        s = with_home_turn(self.skeleton, self.plan.home_turn)
+        joints = np.full((len(crop_cameras), s.n_joints, 3), np.nan)
+        with threads(parallel):
+            kernels.guess_all(
+                crops.heights,
+                crop_cameras,
+                crops.found,
+                _settings(self.plan, s),
+                _voting(self.where),
+                _voting(self.pose),
+                levers(s),
+                KinematicTree.of(s),
+                joints,
+            )
+        return Guesses(in_camera_frame(joints, crop_cameras), crops.found, crops)
+
+    def to_bytes(self) -> bytes:
+        """The forests as the bytes of an .npz without pickle; skeleton and plan are not stored."""
+        arrays: dict[str, Any] = {}
+        for name, forest in (("where", self.where), ("pose", self.pose)):
+            arrays |= {
+                f"{name}_{part}": getattr(forest, part) for part in ("nodes", "roots", "leaves")
+            }
+        packed = io.BytesIO()
+        np.savez_compressed(packed, **arrays)
+        return packed.getvalue()
+
+    @staticmethod
+    def load(path: Path, skeleton: Skeleton, plan: ForestPlan) -> RegressionForest:
+        """Read a trained pair of forests from a file with the bytes of `to_bytes`.
+
+        Raises:
+            ModelError: the file does not contain two complete forests.
+        """
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                where, pose = (
+                    Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
+                    for name in ("where", "pose")
+                )
+            return RegressionForest(skeleton, plan, where, pose)
+        except DAMAGE as error:
+            raise ModelError(
+                f"{path} is not a whole regression forest ({error}); remove it and train again"
+            ) from None
+
+
+def with_home_turn(skeleton: Skeleton, home_turn: tuple[float, ...]) -> Skeleton:
+    """The same body with its base joint's frame, and so its home pose, turned.
+
+    Args:
+        skeleton: the animal's skeleton.
+        home_turn: (3,) rotation vector by which the home pose is turned about the base joint, rad.
+
+    Returns:
+        The skeleton; a pose of base rotation R has the same joints with R exp(home_turn)^T.
+    """
+    if not any(home_turn):
+        return skeleton
+    turn = so3.exp(np.array(home_turn))
+    offsets = skeleton.offsets.copy()
+    rest = skeleton.rest.copy()
+    children = skeleton.parents == 0
+    offsets[children] = offsets[children] @ turn.T
+    rest[children] = turn @ rest[children]
+    return replace(skeleton, offsets=offsets, rest=rest)
+
+
+def levers(skeleton: Skeleton) -> Array:
+    """Lever arms (D,) mm of F2's coordinates: how far a unit moves the home pose's joints.
+
+    It is the root mean square over all joints, and at least 5 % of the animal's length for
+    rotations. Coordinates are the base's rotation about x, y, z (rad), its translation (mm, lever
+    1), the logarithm of the scale, then the angles about the other joints' free axes in the
+    skeleton's order (rad). One unit of a label is then about one millimetre of error.
+    """
+    rotations, positions = forward_kinematics(
+        skeleton, SE3.identity(), np.zeros((skeleton.n_joints, 3)), np.ones(())
+    )
+    below = np.eye(skeleton.n_joints, dtype=bool)
+    for j in range(skeleton.n_joints - 1, 0, -1):
+        below[skeleton.parents[j]] |= below[j]
+    rows: list[float] = []
+    for j in skeleton.solved:
+        offset = positions[below[j]] - positions[j]
+        for k in np.flatnonzero(skeleton.axes[j]):
+            moved = np.cross(rotations[j][:, k], offset)
+            rows.append(float(np.sqrt((moved**2).sum() / skeleton.n_joints)))
+        if j == 0:
+            rows += [1.0, 1.0, 1.0, float(np.sqrt((offset**2).sum() / skeleton.n_joints))]
+    lever = np.array(rows)
+    lever[3:6] = np.inf
+    lever = np.maximum(lever, _LEAST_LEVER * skeleton.length)
+    lever[3:6] = 1.0
+    return lever
+
+
+def coordinates(
+    data: TrainingSet,
+    skeleton: Skeleton,
+    image: NDArray[np.int32],
+    places: Array,
+    headings: Array,
+    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> Array:
+    """True coordinates of F2, relative to a position and a heading that F1 estimated.
+
+    Args:
+        data: training images with truth.
+        skeleton: the animal's skeleton.
+        image: (n,) int32 index of each sample's image.
+        places: (n, 3) base positions, mm, view frame.
+        headings: (n,) headings, rad, view frame.
+        home_turn: (3,) rotation vector by which the home pose is turned, rad, see `with_home_turn`.
+
+    Returns:
+        (n, D) coordinates in lever units.
+    """
+    zero = np.zeros_like(headings)
+    start = SE3(so3.exp(np.stack([zero, zero, headings], axis=1)), places)
+    truth = data.truth
+    base = truth.rotations[image, 0] @ so3.exp(np.array(home_turn)).T
+    twist = (start.inverse() @ SE3(base, truth.positions[image, 0])).log()
+    parts = [twist, np.log(truth.scale[image])[:, None]]
+    for j in skeleton.solved[1:]:
+        parent = truth.rotations[image, skeleton.parents[j]] @ skeleton.rest[j]
+        turn = so3.log(np.swapaxes(parent, 1, 2) @ truth.rotations[image, j])
+        parts.append(turn[:, skeleton.axes[j]])
+    return np.concatenate(parts, axis=1) * levers(with_home_turn(skeleton, home_turn))
+
+
+def _settings(plan: ForestPlan, skeleton: Skeleton) -> kernels.VoteSettings:
+    """Settings of the votes for the kernels."""
+    return kernels.VoteSettings(
+        plan.n_points, skeleton.length, skeleton.length * np.array(plan.bandwidths)
+    )
+
+
+def _voting(forest: Forest) -> kernels.VotingForest:
+    """A forest for the kernels."""
+    return kernels.VotingForest(forest.nodes, forest.roots, forest.leaves)
+
+
+def train_forests(
+    data: TrainingSet,
+    skeleton: Skeleton,
+    plan: ForestPlan,
+    rng: np.random.Generator,
+    report: ProgressCallback,
+) -> RegressionForest:
+    """Grow F1, then F2 from F1's estimates in images that F1's trees were not grown on.
+
+    Args:
+        data: training images with truth; those without an animal are left out.
+        skeleton: the animal's skeleton.
+        plan: how the forests grow.
+        rng: random number generator for pixels, bags and seeds.
+        report: called before each forest with the share done and the name of the part.
+    """
+    report(0.0, "F1")
+    where, in_bag = _grow_where(data, skeleton, plan, rng)
+    report(0.5, "F2")
+    image = np.repeat(np.flatnonzero(data.animal).astype(np.int32), plan.draws)
+    places = np.empty((len(image), 3))
+    headings = np.empty(len(image))
+    unseen = ~in_bag.T[image]
+    unseen |= ~unseen.any(axis=1, keepdims=True)  # all trees were grown on it: use all
+    kernels.locate_all(
+        data.images.heights,
+        data.images.crop_cameras,
+        image,
+        rng.random(len(image)),
+        _settings(plan, skeleton),
+        _voting(where),
+        unseen,
+        places,
+        headings,
+    )
+    labels = coordinates(data, skeleton, image, places, headings, plan.home_turn)
+    turned = np.linalg.norm(
+        labels[:, :3] / levers(with_home_turn(skeleton, plan.home_turn))[:3], axis=1
+    )
+    samples = _samples(data, skeleton, image, places, headings)
+    pose, _ = grow_forest(samples, labels.astype(np.float32), turned < np.pi / 2, plan.pose, rng)
+    return RegressionForest(skeleton, plan, where, pose)
+
+
+def _grow_where(
+    data: TrainingSet, skeleton: Skeleton, plan: ForestPlan, rng: np.random.Generator
+) -> tuple[Forest, NDArray[np.bool_]]:
+    """Grow F1; also returns (T, n_images) bool, the images that each tree was grown on."""
+    animals = np.flatnonzero(data.animal).astype(np.int32)
+    points = np.empty((len(animals), plan.training_points, 3))
+    kernels.points_all(
+        data.images.heights, data.images.crop_cameras, animals, rng.random(len(animals)), points
+    )
+    image = np.repeat(animals, plan.training_points)
+    places = points.reshape(-1, 3)
+    forward = data.truth.rotations[image, 0] @ so3.exp(np.array(plan.home_turn)).T[:, 0]
+    heading = 0.5 * skeleton.length * forward[:, :2]
+    labels = np.concatenate([data.truth.positions[image, 0] - places, heading], axis=1).astype(
+        np.float32
+    )
+    samples = _samples(data, skeleton, image, places, np.zeros(len(image)))
+    return grow_forest(samples, labels, np.ones(len(image), np.bool_), plan.where, rng)
+
+
+def _samples(
+    data: TrainingSet, skeleton: Skeleton, image: NDArray[np.int32], places: Array, headings: Array
+) -> Samples:
+    """Features from positions (n, 3) of images (n,), with offsets turned by headings (n,)."""
+    n = len(image)
+    views = np.empty((n, 1, VIEW), np.float32)
+    kernels.views_all(data.images.crop_cameras, image, places, headings, skeleton.length, views)
+    return Samples(
+        data.images.heights, image, np.ones(n, np.float32), views, np.zeros((n, 1), np.float32)
+    )

@@ -28,19 +28,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.baselines import _kernels as kernels
-from liex_lab.baselines.baseline import DAMAGE, Guesses, Sizeless
+from liex_lab.baselines.baseline import DAMAGE, Baseline, Guesses
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
-from liex_lab.estimation.training import ProgressCallback, TrainingSet
-from liex_lab.runtime.shapes import check_shapes
+from liex_lab.estimation.cascade import TrainingSet
+from liex_lab.estimation.training import ProgressCallback
 from liex_lab.runtime.threads import threads
-from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
 
 if TYPE_CHECKING:
@@ -63,9 +62,7 @@ def frames_of(heights: NDArray[np.int16], crop_cameras: Array) -> Array:
         (n, 5): image pixel (u, v) of the square's centre, half the side in image pixels, the
         animal's mean depth, mm, and half the side in mm at that depth.
     """
-    n = len(crop_cameras)
-    _check(heights, crop_cameras)
-    frames = np.empty((n, N_FRAME))
+    frames = np.empty((len(crop_cameras), N_FRAME))
     kernels.frames_all(heights, crop_cameras, frames)
     return frames
 
@@ -83,20 +80,9 @@ def patches_of(
     Returns:
         (n, PATCH, PATCH) float32 brightness, 0 to 255; 0 outside the animal.
     """
-    n = len(crop_cameras)
-    _check(heights, crop_cameras)
-    check_shapes("patches", ("frames", frames, (n, N_FRAME)))
-    patches = np.empty((n, kernels.PATCH, kernels.PATCH), np.float32)
+    patches = np.empty((len(crop_cameras), kernels.PATCH, kernels.PATCH), np.float32)
     kernels.patches_all(heights, crop_cameras, frames, patches)
     return patches
-
-
-def _check(heights: NDArray[np.int16], crop_cameras: Array) -> None:
-    check_shapes(
-        "patches",
-        ("heights", heights, ("n", "S", "S")),
-        ("crop_cameras", crop_cameras, ("n", N_CROP_CAMERA)),
-    )
 
 
 def targets_of(joints_camera: Array, crop_cameras: Array, frames: Array) -> NDArray[np.float32]:
@@ -184,6 +170,7 @@ def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
         The untrained network; its convolutions have no bias and are followed by batch
         normalisation.
     """
+    import torch
     from torch import nn
 
     def convolution(
@@ -213,22 +200,9 @@ def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
         nn.ReLU(inplace=True),
         nn.Linear(plan.connected, n_outputs),
     )
-    net.to(memory_format=torch_layout())
+    # channels last: convolutions on a CPU are about a third faster
+    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return net
-
-
-def low_precision() -> torch.autocast:
-    """A context in which convolutions and products use bfloat16."""
-    import torch
-
-    return torch.autocast("cpu", torch.bfloat16)
-
-
-def torch_layout() -> Any:
-    """Memory format channels last: convolutions on a CPU are about a third faster."""
-    import torch
-
-    return torch.channels_last
 
 
 @contextmanager
@@ -246,7 +220,7 @@ def torch_threads(parallel: bool) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Cnn(Sizeless):
+class Cnn(Baseline):
     """The trained network as a baseline.
 
     It estimates joints, not a pose: bone lengths are not constrained.
@@ -285,7 +259,8 @@ class Cnn(Sizeless):
         """
         import torch
 
-        with threads(parallel), torch_threads(parallel), torch.no_grad(), low_precision():
+        precision = torch.autocast("cpu", torch.bfloat16)
+        with threads(parallel), torch_threads(parallel), torch.no_grad(), precision:
             frames = frames_of(heights, crop_cameras)
             output = self.net.eval()(_channels(patches_of(heights, crop_cameras, frames)))
         return joints_of(output.float().numpy(), crop_cameras, frames)
@@ -312,9 +287,9 @@ class Cnn(Sizeless):
                     {name: torch.from_numpy(archive[name]) for name in archive.files}
                 )
         except DAMAGE as error:
-            said = str(error).splitlines()[0]
+            message = str(error).splitlines()[0]
             raise ModelError(
-                f"{path} does not hold the CNN's weights ({said}); remove it and train again"
+                f"{path} does not hold the CNN's weights ({message}); remove it and train again"
             ) from None
         return Cnn(skeleton, net)
 
@@ -326,7 +301,7 @@ def _channels(patches: NDArray[np.float32]) -> torch.Tensor:
     import torch
 
     grey = torch.from_numpy((patches - 127.5) / 127.5)
-    return grey[:, None].expand(-1, 3, -1, -1).contiguous(memory_format=torch_layout())
+    return grey[:, None].expand(-1, 3, -1, -1).contiguous(memory_format=torch.channels_last)
 
 
 def train_cnn(
@@ -334,7 +309,7 @@ def train_cnn(
     skeleton: Skeleton,
     plan: CnnPlan,
     rng: np.random.Generator,
-    tell: ProgressCallback,
+    report: ProgressCallback,
 ) -> Cnn:
     """Train the network from scratch with AdamW and a one-cycle learning rate.
 
@@ -343,7 +318,7 @@ def train_cnn(
         skeleton: the animal's skeleton.
         plan: size of the network and of its training.
         rng: random number generator for the initial weights' seed and the order of images.
-        tell: called before each step with the share done and the name of the part being trained.
+        report: called before each step with the share done and the name of the part being trained.
 
     Raises:
         MissingPackageError: torch is not installed.
@@ -364,7 +339,7 @@ def train_cnn(
     for _ in range(plan.epochs):
         order = rng.permutation(animals)
         for start in range(0, len(order) - _BATCH + 1, _BATCH):
-            tell(done / steps, "CNN")
+            report(done / steps, "CNN")
             loss = _loss(net, data, order[start : start + _BATCH])
             optimiser.zero_grad()
             loss.backward()
@@ -384,7 +359,7 @@ def _loss(net: torch.nn.Sequential, data: TrainingSet, rows: NDArray[np.int64]) 
     wanted = torch.from_numpy(
         targets_of(in_camera_frame(data.truth.positions[rows], crop_cameras), crop_cameras, frames)
     )
-    with low_precision():
+    with torch.autocast("cpu", torch.bfloat16):
         output = net(_channels(patches_of(heights, crop_cameras, frames)))
     difference = (output.float() - wanted).reshape(len(rows), -1, 3)
     return torch.sqrt((difference**2).sum(-1) + 1e-8).mean()

@@ -436,24 +436,10 @@ def refine_one(
     angles,
     scale,
 ):
-    """Refine one pose in place by Gauss-Newton steps.
+    """Refine one pose in place by Gauss-Newton steps, fewer if the system is not definite.
 
-    Args:
-        heights: (S, S) int16 height map, 1/16 mm, 0 outside the animal.
-        packed_camera: (17,) packed crop camera.
-        readings: `Readings` of the height map.
-        tree: the kinematic tree.
-        free_angles: its free angles.
-        body: the sphere model.
-        weights: of the residuals.
-        n_steps: number of steps; fewer if the system is not definite.
-        root_rotation: (3, 3) of the base, changed in place.
-        root_position: (3,) of the base, mm, changed in place.
-        angles: (J, 3) rotation vectors of the joints, rad, changed in place.
-        scale: of the bones.
-
-    Returns:
-        The new scale.
+    Changed are the base's root_rotation (3, 3) and root_position (3,) mm, and the joints' angles
+    (J, 3), rad. heights (S, S) int16 are 1/16 mm, 0 outside the animal. Returns the bones' scale.
     """
     n_values = _ROOT + len(tree.free)
     n_joints = tree.parents.size

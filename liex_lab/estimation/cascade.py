@@ -86,10 +86,9 @@ class Candidates:
             scale: (n,) scale of the bones; copied.
             size: (n,) the animal's size over home size; not copied.
         """
-        n = len(image)
-        j = skeleton.n_joints
-        rotations = np.zeros((n, j, 3, 3))
-        positions = np.zeros((n, j, 3))
+        joints = len(image), skeleton.n_joints
+        rotations = np.zeros((*joints, 3, 3))
+        positions = np.zeros((*joints, 3))
         rotations[:, 0] = rotation
         positions[:, 0] = position
         return Candidates(image, rotations, positions, scale.copy(), size)
@@ -152,16 +151,7 @@ class Cascade:
         Returns:
             6 for the base, or 7 with the scale; otherwise the number of the joint's free axes.
         """
-        if joint == 0:
-            return 7 if self.method.regress_scale else 6
-        return int(self.skeleton.axes[joint].sum())
-
-    def _check(self, candidates: Candidates, images: ImageSet | None = None) -> None:
-        """Refuse candidates of another body, or on missing images."""
-        n_joints = self.skeleton.n_joints
-        check_shapes("candidates", ("positions", candidates.positions, ("n", n_joints, 3)))
-        if images is not None:
-            check_index("images", candidates.image, len(images.heights))
+        return int(self.skeleton.axes[joint].sum()) if joint else 6 + self.method.regress_scale
 
     def place(self, candidates: Candidates, joint: int) -> None:
         """Place a joint relative to its parent, which must be in place, at its home angle.
@@ -170,7 +160,6 @@ class Cascade:
             candidates: changed in place.
             joint: number of the joint.
         """
-        self._check(candidates)
         kernels.place_all(
             joint,
             KinematicTree.of(self.skeleton),
@@ -195,11 +184,8 @@ class Cascade:
             if joint:
                 self.place(candidates, joint)
             for c, forest in enumerate(rounds):
-                self.apply(
-                    candidates,
-                    joint,
-                    self.predict(forest, self.samples(images, candidates, [joint])),
-                )
+                values = self.predict(forest, self.samples(images, candidates, [joint]))
+                self.apply(candidates, joint, values)
                 yield joint, c
         self.place_ends(candidates)
 
@@ -244,7 +230,7 @@ class Cascade:
         Returns:
             n samples with one view per joint, on the height maps of the images.
         """
-        self._check(candidates, images)
+        check_index("images", candidates.image, len(images.heights))
         n = len(candidates)
         views = np.empty((n, len(joints), VIEW), np.float32)
         scalars = np.empty((n, kernels.N_SCALARS), np.float32)
@@ -285,19 +271,7 @@ class Cascade:
         samples = self.samples(images, candidates, list(range(self.skeleton.n_joints)))
         if not self.method.explains:
             return samples
-        fit = np.empty((len(candidates), residual_kernels.N_FIT), np.float32)
-        residual_kernels.explain_all(
-            images.heights,
-            images.crop_cameras,
-            images.moments,
-            candidates.image,
-            candidates.rotations,
-            candidates.positions,
-            candidates.scale,
-            candidates.size,
-            body_of(self.balls),
-            fit,
-        )
+        fit = residuals(images, candidates, body_of(self.balls))
         return replace(samples, scalars=np.concatenate([samples.scalars, fit], axis=1))
 
     def apply(self, candidates: Candidates, joint: int, values: NDArray[np.float32]) -> None:
@@ -309,28 +283,14 @@ class Cascade:
             values: (n, n_values) float32 correction, rotations times their lever arm, mm at home
                 size.
         """
+        c = candidates
         method = self.method
-        self._check(candidates)
-        shape = len(candidates), self.n_values(joint)
-        check_shapes("a correction", ("values", values, shape))
         if joint == 0:
             levers = np.array([method.base_lever_mm, method.scale_lever_mm])
-            kernels.correct_base_all(
-                candidates.rotations,
-                candidates.positions,
-                candidates.scale,
-                values,
-                levers,
-                candidates.size,
-            )
+            kernels.correct_base_all(c.rotations, c.positions, c.scale, values, levers, c.size)
         else:
-            kernels.correct_joint_all(
-                joint,
-                candidates.rotations,
-                self.skeleton.axes[joint],
-                values,
-                method.joint_lever_mm,
-            )
+            axes = self.skeleton.axes[joint]
+            kernels.correct_joint_all(joint, c.rotations, axes, values, method.joint_lever_mm)
 
     def labels(
         self, candidates: Candidates, joint: int, truth: Truth
@@ -363,15 +323,14 @@ class Cascade:
                 return twist, keep
             grow = np.log(truth.scale[i] / candidates.scale) * method.scale_lever_mm
             return np.concatenate([twist, grow[:, None]], axis=1), keep
+        axes = self.skeleton.axes[joint]
         if method.point_at:
             child = self.skeleton.next_joint[joint]
-            ahead = (truth.positions[i, child] - estimate.translation)[
-                :, None, :
-            ] @ estimate.rotation
-            turn = aim_about(self.skeleton.offsets[child], ahead[:, 0], self.skeleton.axes[joint])
+            ahead = truth.positions[i, child] - estimate.translation
+            ahead = (ahead[:, None, :] @ estimate.rotation)[:, 0]
+            turn = aim_about(self.skeleton.offsets[child], ahead, axes)[:, axes]
         else:
-            turn = so3.log(np.swapaxes(estimate.rotation, 1, 2) @ true.rotation)
-        turn = turn[:, self.skeleton.axes[joint]]
+            turn = so3.log(np.swapaxes(estimate.rotation, 1, 2) @ true.rotation)[:, axes]
         distance = np.linalg.norm(true.translation - estimate.translation, axis=1) / candidates.size
         keep = (np.linalg.norm(turn, axis=1) < method.keep_bent) & (distance < method.keep_off_mm)
         return turn * method.joint_lever_mm, keep
@@ -382,6 +341,26 @@ def body_of(balls: Spheres) -> residual_kernels.SphereModel:
     return residual_kernels.SphereModel(
         balls.unit_mm, balls.n_own, balls.joints, balls.offsets, balls.share, balls.radius
     )
+
+
+def residuals(
+    images: ImageSet, candidates: Candidates, body: residual_kernels.SphereModel
+) -> NDArray[np.float32]:
+    """Residuals (n, N_FIT) of n posed bodies against their height maps."""
+    out = np.empty((len(candidates), residual_kernels.N_FIT), np.float32)
+    residual_kernels.explain_all(
+        images.heights,
+        images.crop_cameras,
+        images.moments,
+        candidates.image,
+        candidates.rotations,
+        candidates.positions,
+        candidates.scale,
+        candidates.size,
+        body,
+        out,
+    )
+    return out
 
 
 @dataclass(frozen=True)
@@ -397,6 +376,42 @@ class Truth:
     rotations: Array
     positions: Array
     scale: Array
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Images with their true poses in the view frame.
+
+    Attributes:
+        images: m images.
+        truth: true poses of the m images.
+        size: (m,) the true size of each animal over home size.
+        animal: (m,) bool, False if the height map shows another object of about the animal's size;
+            such an image is a negative example of the learned metric, and not used by the
+            regressors.
+    """
+
+    images: ImageSet
+    truth: Truth
+    size: Array
+    animal: NDArray[np.bool_]
+
+    @staticmethod
+    def join(parts: list[TrainingSet]) -> TrainingSet:
+        """Concatenate the images of multiple sets."""
+        images, truths = (
+            [
+                np.concatenate(column)
+                for column in zip(*(vars(one).values() for one in some), strict=True)
+            ]
+            for some in ([p.images for p in parts], [p.truth for p in parts])
+        )
+        return TrainingSet(
+            ImageSet(*images),
+            Truth(*truths),
+            np.concatenate([p.size for p in parts]),
+            np.concatenate([p.animal for p in parts]),
+        )
 
 
 def aim_about(bone: Array, direction: Array, axes: NDArray[np.bool_]) -> Array:

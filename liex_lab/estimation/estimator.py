@@ -23,23 +23,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.kinematics import KinematicTree
-from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError, ModelError
 from liex_lab.estimation import _cascade_kernels as kernels
 from liex_lab.estimation._residual_kernels import SphereModel
 from liex_lab.estimation.cascade import ImageSet, body_of
-from liex_lab.estimation.forest_correction import corrected
-from liex_lab.estimation.head_tail import HeadTailClassifier, both_directions
 from liex_lab.estimation.initial import N_DIRECTIONS, draw_starts, propose, start_poses
 from liex_lab.estimation.model import Model, check_model
-from liex_lab.estimation.refine import Refiner
-from liex_lab.estimation.ridge_correction import SURE_SHARE, RidgeCorrection
-from liex_lab.estimation.scoring import Chosen, choose, with_best, with_expected_error
-from liex_lab.estimation.training import base_at_front
+from liex_lab.estimation.refine import (
+    SURE_SHARE,
+    HeadTailClassifier,
+    Refiner,
+    RidgeCorrection,
+    both_directions,
+)
+from liex_lab.estimation.scoring import Chosen, choose, corrected, with_best, with_expected_error
 from liex_lab.forests.forest import Forest
-from liex_lab.geometry import SE3
 from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
 
@@ -103,55 +103,45 @@ class Detection:
     @staticmethod
     def join(parts: Sequence[Detection]) -> Detection:
         """Concatenate detections with equally many candidates per frame."""
-        rest = (np.concatenate([getattr(p, name) for p in parts]) for name in _OF_SIGHT)
+        names = ("crop_cameras", "rotations", "positions", "scores")
+        rest = (np.concatenate([getattr(p, name) for p in parts]) for name in names)
         return Detection(HeightMaps.join([p.crops for p in parts]), *rest)
+
+    @property
+    def images(self) -> ImageSet:
+        """The height maps with their crop cameras and moments."""
+        return ImageSet(self.crops.heights, self.crop_cameras, self.crops.moments)
 
     @property
     def usable(self) -> NDArray[np.bool_]:
         """(n,) bool: there is a component in the frame, and a candidate for it."""
         return self.crops.found & np.isfinite(self.scores).any(axis=1)
 
-    def put(self, rows: NDArray[np.int64], other: Detection) -> None:
-        """Overwrite the rows (m,) by another detection of m frames."""
-        self.crops.put(rows, other.crops)
-        for name in _OF_SIGHT:
-            getattr(self, name)[rows] = getattr(other, name)
-
-    def nothing(self) -> Detection:
-        """An empty detection of as many frames."""
-        nothing = self[np.arange(len(self.crop_cameras))]
-        nothing.crops.n_px[:] = 0
-        nothing.scores[:] = np.inf
-        return nothing
-
-    def opposite(self, usable: NDArray[np.bool_], tip: int) -> Detection:
+    def opposite(self, tip: int) -> Detection:
         """Keep only the candidates that point away from the best one, base to tip.
 
         Excluded candidates take the positions of the best remaining one, so that the number of
         candidates stays the same.
 
         Args:
-            usable: (n,) bool; other frames keep no candidate.
             tip: the joint that defines the direction from the base.
 
         Returns:
             The detection with infinite scores if no candidate has the opposite direction.
         """
         _, other, _, away = both_directions(self.positions, self.scores, tip)
-        rows = np.arange(len(self.scores))
-        scores = np.where(away & usable[:, None], self.scores, np.inf)
+        rows = np.arange(len(self.scores))[:, None]
+        usable = self.usable[:, None]
+        scores = np.where(away & usable, self.scores, np.inf)
         taken = np.where(away, np.arange(scores.shape[1]), other[:, None])
-        some = away.any(axis=1) & usable
+        some = away.any(axis=1, keepdims=True) & usable
         return Detection(
             self.crops,
             self.crop_cameras,
-            self.rotations[rows[:, None], taken],
-            self.positions[rows[:, None], taken],
-            np.where(some[:, None], np.take_along_axis(scores, taken, axis=1), np.inf),
+            self.rotations[rows, taken],
+            self.positions[rows, taken],
+            np.where(some, np.take_along_axis(scores, taken, axis=1), np.inf),
         )
-
-
-_OF_SIGHT = ("crop_cameras", "rotations", "positions", "scores")
 
 
 @dataclass(frozen=True)
@@ -202,27 +192,6 @@ class PoseEstimator:
         return _pack(regressors), _pack([model.pruner or model.metric]), _pack([model.metric])
 
     @cached_property
-    def _tree(self) -> KinematicTree:
-        """The kinematic tree as a record for the kernels."""
-        return KinematicTree.of(self.skeleton)
-
-    def _tuning(self, n_starts: int) -> kernels.CascadeSettings:
-        """The method's settings as a record for the kernels."""
-        method = self.model.method
-        keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
-        return kernels.CascadeSettings(
-            method.rounds_of(0),
-            method.rounds,
-            method.reaches(self.skeleton.n_joints),
-            float(method.base_lever_mm),
-            float(method.joint_lever_mm),
-            float(method.scale_lever_mm),
-            method.mean_shift_mm,
-            min(keep or n_starts, n_starts),
-            np.array(self.skeleton.solved[: self.n_joints or None]),
-        )
-
-    @cached_property
     def _body(self) -> SphereModel:
         """The sphere model that candidates are compared with; empty unless the method uses it."""
         if not self.model.method.explains:
@@ -246,7 +215,7 @@ class PoseEstimator:
 
     def candidates(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
-    ) -> tuple[Array, Array, Array, Array]:
+    ) -> Detection:
         """Process all initial poses by the cascade and score them (Lie-X Algorithm 1).
 
         Candidates are pruned after the base joint if the model has a pruner; a head-tail
@@ -255,63 +224,64 @@ class PoseEstimator:
         Args:
             crops: height maps of n frames.
             crop_cameras: (n, 17) crop cameras of the height maps.
-            size: the animal's size over home size.
+            size: the animal's size over home size; ignored by methods of fixed size.
             parallel: use all cores rather than one.
 
         Returns:
-            Of the K surviving candidates of each frame, in the view frame: rotations (n, K, J, 3,
-                3), positions (n, K, J, 3) mm, scales (n, K) of the bones, and the learned metric's
-                scores (n, K), mm at home size; the scores are infinite if no animal was found.
+            The K surviving candidates of each frame, with the learned metric's scores.
         """
         method = self.model.method
         skeleton = self.skeleton
+        size = size if method.session_size else 1.0
         images = ImageSet(crops.heights, crop_cameras, crops.moments)
         n = len(crop_cameras)
         k = self._starts.shape[1]
         sizes = np.full((n, k), size)
         base_rotation, base_position, scales = start_poses(
-            crops.moments,
-            self._starts,
-            sizes,
-            skeleton.length,
-            base_at_front(skeleton),
-            method.axis_start,
-            method.camera_view,
-            method.home_turn,
+            crops.moments, self._starts, sizes, skeleton, method
         )
-        if self.model.cascade.proposals is not None:
+        if self.model.proposals is not None:
             base_rotation, base_position = propose(
-                self.model.cascade.proposals, images, sizes[:, 0], method
+                self.model.proposals, images, sizes[:, 0], method
             )
-        tuning = self._tuning(k)
+        keep = method.survivors if self.model.pruner is not None and not self.unpruned else 0
+        settings = kernels.CascadeSettings(
+            method.rounds_of(0),
+            method.rounds,
+            method.reaches(skeleton.n_joints),
+            float(method.base_lever_mm),
+            float(method.joint_lever_mm),
+            float(method.scale_lever_mm),
+            method.mean_shift_mm,
+            min(keep or k, k),
+            np.array(skeleton.solved[: self.n_joints or None]),
+        )
         starts = kernels.CandidatePoses(
             np.ascontiguousarray(base_rotation[:, :, None]),
             base_position[:, :, None].copy(),
             scales,
         )
+        kept = n, settings.keep, skeleton.n_joints
         poses = kernels.CandidatePoses(
-            np.zeros((n, tuning.keep, skeleton.n_joints, 3, 3)),
-            np.zeros((n, tuning.keep, skeleton.n_joints, 3)),
-            np.zeros((n, tuning.keep)),
+            np.zeros((*kept, 3, 3)), np.zeros((*kept, 3)), np.zeros(kept[:2])
         )
-        scores = np.full((n, tuning.keep), np.inf)
+        scores = np.full(kept[:2], np.inf)
         with threads(parallel):
             kernels.estimate_all(
                 kernels.FrameBatch(crops.heights, crop_cameras, crops.moments, size),
                 np.flatnonzero(crops.found),
-                self._tree,
+                KinematicTree.of(skeleton),
                 *self._packed,
-                tuning,
+                settings,
                 self._body,
                 starts,
                 poses,
                 scores,
             )
-            if self.model.facing is None or not n:
-                return *poses, scores
-            facing = HeadTailClassifier(skeleton, self.model.facing)
-            scores = facing.judged(images, poses.positions, scores, size)
-        return *poses, scores
+            if self.model.facing is not None and n:
+                facing = HeadTailClassifier(skeleton, self.model.facing)
+                scores = facing.judged(images, poses.positions, scores, size)
+        return Detection(crops, crop_cameras, poses.rotations, poses.positions, scores)
 
     def estimate(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
@@ -329,8 +299,7 @@ class PoseEstimator:
         Returns:
             The poses in the camera frame, with expected errors.
         """
-        size = size if self.model.method.session_size else 1.0
-        return self._estimates(self._detect_both(depths, scene, size, parallel)[0], size, parallel)
+        return self._estimates(self.detect(depths, scene, size, parallel)[0], size, parallel)
 
     def hypotheses(
         self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
@@ -348,27 +317,8 @@ class PoseEstimator:
                 direction, and the same two of the second component of about the animal's size. Rows
                 without such a hypothesis are not found.
         """
-        size = size if self.model.method.session_size else 1.0
-        return self._both_directions(
-            self._detect_both(depths, scene, size, parallel)[:2], size, parallel
-        )
-
-    def second_is_animal(
-        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
-    ) -> NDArray[np.bool_]:
-        """Whether the animal is the second component of a frame, not the first; see `estimate`.
-
-        Args:
-            depths: (n, H, W) float32 mm, 0 where unread.
-            scene: the segmenter fitted to the recording.
-            size: the animal's spine over the home length; ignored by methods of fixed size.
-            parallel: use all cores rather than one.
-
-        Returns:
-            (n,) bool, for the two components of `Segmenter.extract_both`.
-        """
-        size = size if self.model.method.session_size else 1.0
-        return self._detect_both(depths, scene, size, parallel)[2]
+        first, second, _ = self.detect(depths, scene, size, parallel)
+        return self.both_directions([first, second], size, parallel)
 
     def best_of(
         self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
@@ -384,104 +334,88 @@ class PoseEstimator:
         Returns:
             The poses in the camera frame, as from `estimate`.
         """
-        size = size if self.model.method.session_size else 1.0
-        return self._estimates(self._sighted(crops, crop_cameras, size, parallel), size, parallel)
+        return self._estimates(self.candidates(crops, crop_cameras, size, parallel), size, parallel)
 
     def both_directions(
-        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool = True
-    ) -> tuple[Estimates, Estimates]:
-        """Estimate the best pose per height map, and the best one in the opposite direction.
+        self, detections: Sequence[Detection], size: float, parallel: bool = True
+    ) -> tuple[Estimates, ...]:
+        """Estimate the best pose of each detection, and the best one in the opposite direction.
+
+        All are chosen in one call, as the cost of few poses is that of the call.
 
         Args:
-            crops: height maps of n frames.
-            crop_cameras: (n, 17) crop cameras of the height maps.
+            detections: of n frames each.
             size: the animal's spine over the home length; ignored by methods of fixed size.
             parallel: use all cores rather than one.
 
         Returns:
-            Both estimates in the camera frame; rows of the second without such a pose are not
-            found.
+            Two estimates of each detection in turn, in the camera frame; rows of the second without
+            such a pose are not found.
         """
-        size = size if self.model.method.session_size else 1.0
-        best, turned = self._both_directions(
-            (self._sighted(crops, crop_cameras, size, parallel),), size, parallel
-        )
-        return best, turned
-
-    def _sighted(
-        self, crops: HeightMaps, crop_cameras: Array, size: float, parallel: bool
-    ) -> Detection:
-        """The segmented component of each frame, with its candidates."""
-        rotations, positions, _, scores = self.candidates(crops, crop_cameras, size, parallel)
-        return Detection(crops, crop_cameras, rotations, positions, scores)
-
-    def _both_directions(
-        self, sights: Sequence[Detection], size: float, parallel: bool
-    ) -> tuple[Estimates, ...]:
-        """The chosen poses of each detection and those in the opposite direction, in turn.
-
-        All are chosen in one call, as the cost of few poses is that of the call.
-        """
-        both = [one for s in sights for one in (s, s.opposite(s.usable, self.skeleton.tip))]
+        both = [one for found in detections for one in (found, found.opposite(self.skeleton.tip))]
         whole = self._estimates(Detection.join(both), size, parallel)
         n = len(both[0].crop_cameras)
         return tuple(whole[k * n : (k + 1) * n] for k in range(len(both)))
 
-    def _detect_both(
-        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool
+    def detect(
+        self, depths: NDArray[np.float32], scene: Segmenter, size: float, parallel: bool = True
     ) -> tuple[Detection, Detection, NDArray[np.bool_]]:
         """Detect the animal with its candidates, and the next likely component; see `estimate`.
 
-        The last value is whether (n,) the animal is the second component.
+        Of two components of about the animal's size, area and volume decide which is the animal,
+        and, if the metric was trained with other objects, its scores.
+
+        Args:
+            depths: (n, H, W) float32 mm, 0 where unread.
+            scene: the segmenter fitted to the recording.
+            size: the animal's spine over the home length; ignored by methods of fixed size.
+            parallel: use all cores rather than one.
+
+        Returns:
+            Both detections, the second without pixels where there is no such component; and (n,)
+            bool, whether the animal is the second component of `Segmenter.extract_both`.
         """
-        camera_view = self.model.method.camera_view
-        crops, others = scene.extract_both(depths, size, parallel, camera_view)
+        method = self.model.method
+        size = size if method.session_size else 1.0
+        crops, others = scene.extract_both(depths, size, parallel, method.camera_view)
         n = len(depths)
         unsure = np.flatnonzero(crops.n_blobs > 1)
         # in one go, as a call costs as much as a frame
         joined = HeightMaps.join([crops, others[unsure]]) if len(unsure) else crops
-        both = self._sighted(joined, scene.crop_cameras(joined, camera_view), size, parallel)
-        first = both[:n] if len(unsure) else both
-        second = first.nothing()
-        turned = np.zeros(n, np.bool_)
+        crop_cameras = scene.crop_cameras(joined, method.camera_view)
+        both = self.candidates(joined, crop_cameras, size, parallel)
+        first = np.arange(n)
+        second = np.arange(n)
         if len(unsure):
-            other = both[n:]
-            better = self._is_animal(depths[unsure], scene, size, first[unsure], other)
-            second.put(unsure, other)
-            rows = unsure[better]
-            kept = first[rows]
-            first.put(rows, other[better])
-            second.put(rows, kept)
-            turned[rows] = True
-        return first, second, turned
+            pair = both.crops[unsure], both.crops[n:]
+            if method.camera_view:  # similarity is measured in the scene's own view
+                pair = scene.extract_both(depths[unsure], size)
+            weight = _MM_PER_MISFIT * self.skeleton.relative_size
+            misfit, other_misfit = (weight * scene.misfit(crop) for crop in pair)
+            if method.metric_on_own:
+                misfit = both.scores[unsure].min(axis=1) + misfit
+                other_misfit = both.scores[n:].min(axis=1) + other_misfit
+            second[unsure] = n + np.arange(len(unsure))
+            swapped = unsure[other_misfit < misfit]
+            first[swapped], second[swapped] = second[swapped], swapped
+        animal, other = both[first], both[second]
+        absent = crops.n_blobs < 2
+        other.crops.n_px[absent] = 0
+        other.scores[absent] = np.inf
+        return animal, other, first >= n
 
-    def _estimates(self, sight: Detection, size: float, parallel: bool) -> Estimates:
+    def _estimates(self, detection: Detection, size: float, parallel: bool) -> Estimates:
         """The chosen poses of a detection, in the camera frame."""
-        crops = sight.crops
-        usable = sight.usable
-        detected = sight[np.flatnonzero(usable)]
-        images = ImageSet(detected.crops.heights, detected.crop_cameras, detected.crops.moments)
-        picked = self.pick(
-            images, size, detected.rotations, detected.positions, detected.scores, parallel
-        )
-        picked = with_expected_error(picked, self.model, images.moments, images.crop_cameras, size)
-        whole = _spread_out(picked, usable, self.skeleton.n_joints)
-        return Estimates(
-            replace(whole, pose=whole.pose.moved(view_of(sight.crop_cameras).inverse())),
-            usable,
-            crops,
-        )
+        size = size if self.model.method.session_size else 1.0
+        usable = detection.usable
+        some = detection[np.flatnonzero(usable)]
+        picked = self.pick(some, size, parallel)
+        whole = with_expected_error(picked, self.model, some.images, size).spread_over(usable)
+        pose = whole.pose.moved(view_of(detection.crop_cameras).inverse())
+        return Estimates(replace(whole, pose=pose), usable, detection.crops)
 
-    def pick(
-        self,
-        images: ImageSet,
-        size: float,
-        rotations: Array,
-        positions: Array,
-        scores: Array,
-        parallel: bool = True,
-    ) -> Chosen:
-        """Choose one pose per height map from its candidates, and correct it.
+    def pick(self, detection: Detection, size: float, parallel: bool = True) -> Chosen:
+        """Choose one pose per frame from its candidates, and correct it.
 
         The best candidates are averaged on the manifold (see `choose`). If the method refines, the
         mean and the best candidates are fitted to the height map by Gauss-Newton steps, and the
@@ -489,60 +423,31 @@ class PoseEstimator:
         them.
 
         Args:
-            images: height maps of n frames, with their crop cameras and moments.
+            detection: n frames, each with at least one candidate.
             size: the animal's size over home size.
-            rotations: (n, K, J, 3, 3) joint frames of the candidates, view frame.
-            positions: (n, K, J, 3) joints of the candidates, mm, view frame.
-            scores: (n, K) predicted errors, mm at home size.
             parallel: use all cores rather than one.
 
         Returns:
             The chosen poses in the view frame; their expected error is still that of `choose`.
         """
         method = self.model.method
-        picked = choose(
-            self.skeleton, method, self.model.calibration, size, rotations, positions, scores
-        )
+        skeleton = self.skeleton
+        images = detection.images
+        candidates = detection.rotations, detection.positions, detection.scores
+        picked = choose(skeleton, method, self.model.calibration, size, *candidates)
+        if not len(detection.scores):
+            return picked
         with threads(parallel):
-            if method.refine_steps and len(scores):
-                poses = with_best(
-                    self.skeleton, picked.pose, method.refined, rotations, positions, scores
-                )
+            if method.refine_steps:
+                poses = with_best(skeleton, picked.pose, method.refined, *candidates)
                 pose, fit = self._refiner.best(poses, images, size, method.refine_steps)
                 picked = replace(picked, pose=pose, fit=fit, frame_scale=pose.scale)
             picked = corrected(picked, self.model, images, size)
-            if self.model.settler is None or not len(scores):
+            if self.model.settler is None:
                 return picked
-            ridge = RidgeCorrection(self.skeleton, self.model.settler).correct(
-                picked.pose, images, size
-            )
-        return replace(
-            picked,
-            pose=ridge.pose,
-            frame_scale=size * np.exp(ridge.grown),
-            scale_trust=ridge.clear,
-        )
-
-    def _is_animal(
-        self,
-        depths: NDArray[np.float32],
-        scene: Segmenter,
-        size: float,
-        first: Detection,
-        second: Detection,
-    ) -> NDArray[np.bool_]:
-        """Whether (n,) the second of two components of about the animal's size is the animal.
-
-        Decided by area and volume and, if the metric was trained with other objects, by its scores.
-        """
-        weight = _MM_PER_MISFIT * self.skeleton.relative_size
-        crops = first.crops, second.crops
-        if self.model.method.camera_view:  # similarity is measured in the scene's own view
-            crops = scene.extract_both(depths, size)
-        misfits = [weight * scene.misfit(crop) for crop in crops]
-        if not self.model.method.metric_on_own:
-            return misfits[1] < misfits[0]
-        return second.scores.min(axis=1) + misfits[1] < first.scores.min(axis=1) + misfits[0]
+            ridge = RidgeCorrection(skeleton, self.model.settler)
+            pose, grown, clear = ridge.correct(picked.pose, images, size)
+        return replace(picked, pose=pose, frame_scale=size * np.exp(grown), scale_trust=clear)
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames of the recording.
@@ -562,9 +467,9 @@ class PoseEstimator:
         Raises:
             EstimationError: no animal was found in the sampled frames.
         """
-        guess = self.size_from_area(scene.area_mm2)
         if not self.model.method.session_size:
             return 1.0
+        guess = float(np.sqrt(scene.area_mm2 / self.model.calibration.area_mm2))
         # the forest correction has learned the usual proportions and would bias the size
         uncorrected = replace(self, model=replace(self.model, corrector=None))
         for _ in range(_SIZE_PASSES):
@@ -594,14 +499,6 @@ class PoseEstimator:
         )
         return np.asarray(scale[found[np.argsort(-trust[found])[: max(8, n_trusted)]]])
 
-    def size_from_area(self, area_mm2: float) -> float:
-        """First guess of the animal's size over home size, the square root of a ratio of areas.
-
-        Args:
-            area_mm2: the animal's usual area seen from above, mm^2.
-        """
-        return float(np.sqrt(area_mm2 / self.model.calibration.area_mm2))
-
 
 def _pack(forests: list[Forest]) -> kernels.Trees:
     """Pack forests of equally many trees into one node array.
@@ -624,34 +521,4 @@ def _pack(forests: list[Forest]) -> kernels.Trees:
         np.concatenate([forest.leaves.ravel() for forest in forests]),
         np.cumsum(sizes) - sizes,
         np.array([forest.leaves.shape[1] for forest in forests]),
-    )
-
-
-def _spread_out(picked: Chosen, usable: NDArray[np.bool_], n_joints: int) -> Chosen:
-    """The chosen poses of the usable frames as rows of all frames, NaN elsewhere."""
-    n = len(usable)
-
-    def rows(values: Array, *shape: int) -> Array:
-        """The values as rows of all frames, NaN where the frame is not usable."""
-        out = np.full((n, *shape), np.nan)
-        out[usable] = values
-        return out
-
-    pose = Pose(
-        SE3(rows(picked.pose.root.rotation, 3, 3), rows(picked.pose.root.translation, 3)),
-        rows(picked.pose.angles, n_joints, 3),
-        rows(picked.pose.scale),
-    )
-    return Chosen(
-        pose,
-        rows(picked.sd_root, 6),
-        rows(picked.sd_angles, n_joints, 3),
-        rows(picked.sd_mm, n_joints),
-        rows(picked.error_mm),
-        rows(picked.score),
-        rows(picked.spread),
-        rows(picked.doubts, 4),
-        rows(picked.fit, picked.fit.shape[1]),
-        rows(picked.frame_scale),
-        rows(picked.scale_trust),
     )

@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from liex_lab.body.skeleton import REFERENCE_MM
+from liex_lab.body.skeleton import REFERENCE_MM, Skeleton
 from liex_lab.estimation import _feature_kernels as kernels
-from liex_lab.estimation.cascade import ImageSet
+from liex_lab.estimation.cascade import ImageSet, TrainingSet
 from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict_each
 from liex_lab.forests.grow import grow_forest
 from liex_lab.geometry import so3
-from liex_lab.runtime.shapes import check_shapes
 from liex_lab.scene.height_maps import moment_columns
 
 Array = NDArray[np.float64]
@@ -59,33 +58,22 @@ def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> A
 
 
 def start_poses(
-    moments: Array,
-    starts: Array,
-    size: Array,
-    home_length: float,
-    base_at_front: bool,
-    axis_start: bool,
-    camera_view: bool = False,
-    home_turn: tuple[float, ...] = (0.0, 0.0, 0.0),
+    moments: Array, starts: Array, size: Array, skeleton: Skeleton, method: Method
 ) -> tuple[Array, Array, Array]:
     """Base poses of K candidates for each of n animals.
 
     Along the long axis, every other start points in the opposite direction, and the spread of the
-    headings increases with the roundness of the animal. The paper's start has any heading in (-pi,
-    pi), the base at the centroid and at the animal's mean height, and bones scaled by a factor
-    uniform in [0.9, 1.1].
+    headings increases with the roundness of the animal; in camera view, an animal rises or sinks
+    with the slope of its back. The paper's start has any heading in (-pi, pi), the base at the
+    centroid and at the animal's mean height, and bones scaled by a factor uniform in [0.9, 1.1].
 
     Args:
         moments: (n, 9) moments of the height map, see `HeightMaps`.
         starts: (n or 1, K, 4) numbers drawn by `draw_starts`.
         size: (n, K) the animal's size over home size.
-        home_length: spine length at home, mm.
-        base_at_front: the base joint is the animal's front; else its rear.
-        axis_start: start along the long axis; else as the paper does.
-        camera_view: heights are not those above a floor; such an animal, started along its axis,
-            rises or sinks with the slope of its back.
-        home_turn: (3,) rotation vector, rad, of the home pose relative to the view from above, as
-            for a hand that shows its palm.
+        skeleton: the animal's; its base joint is the front, like the fish's head, or the rear.
+        method: whether to start along the long axis, the view of the height map, and the rotation
+            of the home pose relative to the view from above, as for a hand that shows its palm.
 
     Returns:
         Base rotation (n, K, 3, 3), base position (n, K, 3) mm and scale (n, K), view frame.
@@ -96,54 +84,46 @@ def start_poses(
     centre = np.stack([blob.x, blob.y], axis=-1)[:, None]
     position = np.empty((n, k, 3))
     mean_height = (blob.volume_mm3 / np.maximum(blob.area_mm2, 1.0))[:, None]
-    if axis_start:
+    home_length = skeleton.length
+    opposite = np.arange(k) % 2
+    if method.axis_start:
         jitter = _JITTER_MM * round(home_length / REFERENCE_MM, 6)
-        roundness = blob.sd_across / np.maximum(blob.sd_along, 1e-6)
-        spread = _JITTER[0] + _JITTER[1] * roundness**2
-        heading = (
-            blob.angle[:, None] + np.pi * (np.arange(k) % 2) + spread[:, None] * starts[..., 0]
-        )
+        spread = _JITTER[0] + _JITTER[1] * (blob.sd_across / np.maximum(blob.sd_along, 1e-6)) ** 2
+        heading = blob.angle[:, None] + np.pi * opposite + spread[:, None] * starts[..., 0]
         scale = size.copy()
+        base_at_front = skeleton.offsets[skeleton.next_joint[0], 0] < 0
         behind = _BEHIND * home_length * scale * (-1.0 if base_at_front else 1.0)
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         position[..., :2] = (
             centre - behind[..., None] * direction + jitter * scale[..., None] * starts[..., 1:3]
         )
         high = _HIGH * home_length * scale
-        position[..., 2] = mean_height - _LOW * home_length * scale if camera_view else high
+        low = mean_height - _LOW * home_length * scale
+        position[..., 2] = low if method.camera_view else high
     else:
         heading = np.pi * starts[..., 3]
         # the quantile of a standard normal number is uniform
         scale = size * (1.0 + _SCALED_BY * (2.0 * ndtr(starts[..., 1]) - 1.0))
         position[..., :2] = centre
         position[..., 2] = mean_height
-    rotation = np.zeros((n, k, 3, 3))
-    rotation[..., 0, 0] = np.cos(heading)
-    rotation[..., 0, 1] = -np.sin(heading)
-    rotation[..., 1, 0] = np.sin(heading)
-    rotation[..., 1, 1] = np.cos(heading)
-    rotation[..., 2, 2] = 1.0
-    if axis_start and camera_view:
-        rise = (
-            np.arctan(blob.slope[:, None]) * (1.0 - 2.0 * (np.arange(k) % 2))
-            + _JITTER_RISE * starts[..., 3]
-        )
-        rotation = rotation @ _lifted(rise)
+    rotation = _turned(heading, 0, 1)
+    if method.axis_start and method.camera_view:
+        slope = np.arctan(blob.slope[:, None]) * (1.0 - 2.0 * opposite)
+        rise = slope + _JITTER_RISE * starts[..., 3]
+        rotation = rotation @ _turned(rise, 0, 2)
         # the base is ahead of or behind the middle of the animal
         position[..., 2] -= behind * np.sin(rise)
-    if any(home_turn):
-        rotation = rotation @ so3.exp(np.array(home_turn))
+    if any(method.home_turn):
+        rotation = rotation @ so3.exp(np.array(method.home_turn))
     return rotation, position, scale
 
 
-def _lifted(rise: Array) -> Array:
-    """Rotations (..., 3, 3) that lift a body's front by `rise` (...) rad."""
-    rotation = np.zeros((*rise.shape, 3, 3))
-    rotation[..., 0, 0] = np.cos(rise)
-    rotation[..., 0, 2] = -np.sin(rise)
-    rotation[..., 2, 0] = np.sin(rise)
-    rotation[..., 2, 2] = np.cos(rise)
-    rotation[..., 1, 1] = 1.0
+def _turned(angle: Array, a: int, b: int) -> Array:
+    """Rotations (..., 3, 3) from axis a towards axis b by an angle (...), rad."""
+    rotation = np.zeros((*angle.shape, 3, 3)) + np.eye(3)
+    rotation[..., a, a] = rotation[..., b, b] = np.cos(angle)
+    rotation[..., b, a] = np.sin(angle)
+    rotation[..., a, b] = -rotation[..., b, a]
     return rotation
 
 
@@ -169,20 +149,16 @@ def views_along_axis(
         m, 3) mm, view frame.
     """
     m = len(images.heights)
-    check_shapes("proposals", ("size", size, (m,)))
     image = np.repeat(np.arange(m, dtype=np.int32), N_DIRECTIONS)
-    moments = images.moments[image]
-    blob = moment_columns(moments)
-    heading = blob.angle + np.pi * (np.arange(N_DIRECTIONS * m) % N_DIRECTIONS)
+    opposite = np.arange(N_DIRECTIONS * m) % N_DIRECTIONS
+    blob = moment_columns(images.moments[image])
     turn = np.zeros((N_DIRECTIONS * m, 3))
-    turn[:, 2] = heading
+    turn[:, 2] = blob.angle + np.pi * opposite
     rotation = so3.exp(turn)
     position = np.column_stack([blob.x, blob.y, blob.volume_mm3 / np.maximum(blob.area_mm2, 1.0)])
     each = size[image]
     views = np.empty((N_DIRECTIONS * m, 1, VIEW), np.float32)
     scalars = np.empty((N_DIRECTIONS * m, kernels.N_SCALARS), np.float32)
-    # some segmenters determine the direction of the long axis
-    directions = (1000.0 - 2000.0 * (np.arange(N_DIRECTIONS * m) % N_DIRECTIONS)).astype(np.float32)
     kernels.all_features(
         np.zeros(1, np.int64),
         images.crop_cameras,
@@ -196,31 +172,19 @@ def views_along_axis(
         views,
         scalars,
     )
-    rows = np.column_stack([scalars, directions])
-    return (
-        Samples(images.heights, image, (1.0 / each).astype(np.float32), views, rows),
-        rotation,
-        position,
-    )
+    # some segmenters determine the direction of the long axis
+    rows = np.column_stack([scalars, (1000.0 - 2000.0 * opposite).astype(np.float32)])
+    samples = Samples(images.heights, image, (1.0 / each).astype(np.float32), views, rows)
+    return samples, rotation, position
 
 
 def train_proposals(
-    images: ImageSet,
-    rotations: Array,
-    positions: Array,
-    size: Array,
-    keep: NDArray[np.bool_],
-    method: Method,
-    rng: np.random.Generator,
+    data: TrainingSet, method: Method, rng: np.random.Generator
 ) -> tuple[Forest, NDArray[np.bool_]]:
-    """Train the forest that proposes base poses.
+    """Train the forest that proposes base poses, on the images that show the animal.
 
     Args:
-        images: m images.
-        rotations: (m, 3, 3) true base rotations, view frame.
-        positions: (m, 3) true base positions, mm, view frame.
-        size: (m,) the animals' true size over home size; an error is added to it.
-        keep: (m,) bool, the images to learn from.
+        data: m training images with truth; an error is added to the animals' size.
         method: states the plan, the reach of the features and the lever arm of rotations.
         rng: source of bags, seeds and size errors.
 
@@ -229,18 +193,17 @@ def train_proposals(
         grown on.
     """
     assert method.proposals is not None
-    guess = size * np.exp(_SIZE_SD * rng.standard_normal(len(size)))
-    samples, frame, centre = views_along_axis(images, guess, method.proposal_reach_mm)
+    truth = data.truth
+    guess = data.size * np.exp(_SIZE_SD * rng.standard_normal(len(data.size)))
+    samples, frame, centre = views_along_axis(data.images, guess, method.proposal_reach_mm)
     i = samples.image
-    turned = np.swapaxes(frame, 1, 2) @ rotations[i]
-    offset = np.einsum("nji,nj->ni", frame, positions[i] - centre) / guess[i][:, None]
-    labels = np.concatenate([method.base_lever_mm * turned.reshape(-1, 9), offset], axis=1).astype(
-        np.float32
+    turned = np.swapaxes(frame, 1, 2) @ truth.rotations[i, 0]
+    offset = np.einsum("nji,nj->ni", frame, truth.positions[i, 0] - centre) / guess[i][:, None]
+    labels = np.concatenate([method.base_lever_mm * turned.reshape(-1, 9), offset], axis=1)
+    forest, in_bag = grow_forest(
+        samples, labels.astype(np.float32), data.animal[i], method.proposals, rng
     )
-    forest, in_bag = grow_forest(samples, labels, keep[i], method.proposals, rng)
-    return Forest(
-        forest.nodes, forest.roots, forest.leaves.astype(np.float16).astype(np.float32)
-    ), in_bag
+    return forest.quantised(), in_bag
 
 
 def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tuple[Array, Array]:
@@ -258,16 +221,12 @@ def propose(forest: Forest, images: ImageSet, size: Array, method: Method) -> tu
     """
     samples, frame, centre = views_along_axis(images, size, method.proposal_reach_mm)
     votes = predict_each(forest, samples).astype(float)
-    turned = so3.nearest_rotation(votes[..., :9].reshape(*votes.shape[:2], 3, 3))
-    rotation = frame[:, None] @ turned
+    rotation = frame[:, None] @ so3.nearest_rotation(votes[..., :9].reshape(*votes.shape[:2], 3, 3))
     offset = np.einsum("nij,ntj->nti", frame, votes[..., 9:]) * size[samples.image][:, None, None]
     position = centre[:, None] + offset
 
-    def in_order(values: Array) -> Array:
-        """`values` (2 m, T, ...) reordered to (m, 2 T, ...), the tree varying more slowly."""
-        by_direction = values.reshape(len(size), N_DIRECTIONS, forest.n_trees, *values.shape[2:])
-        return np.swapaxes(by_direction, 1, 2).reshape(
-            len(size), N_DIRECTIONS * forest.n_trees, *values.shape[2:]
-        )
-
-    return in_order(rotation), in_order(position)
+    m = len(size)
+    # from (2 m, T, ...) to (m, 2 T, ...), the tree varying more slowly
+    by_direction = (v.reshape(m, N_DIRECTIONS, -1, *v.shape[2:]) for v in (rotation, position))
+    rotation, position = (np.swapaxes(v, 1, 2).reshape(m, -1, *v.shape[3:]) for v in by_direction)
+    return rotation, position

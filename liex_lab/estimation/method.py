@@ -66,7 +66,7 @@ class Method:
         refined: candidates that are fitted in addition to the mean of the best; the best fit is
             chosen.
         explains: the metric also uses the residuals of the posed body against the height map.
-        tells_facing: a head-tail classifier decides if the metric is unsure, see `head_tail`.
+        tells_facing: a head-tail classifier decides if the metric is unsure, see `refine`.
     """
 
     variant: str
@@ -118,7 +118,7 @@ class Method:
     # candidates refined in addition to the mean of the best; the best fit is chosen
     refined: int = 0
     explains: bool = False  # the metric also uses the residuals of the posed body
-    # a network separates head from tail if the metric is unsure, see `head_tail`
+    # a network separates head from tail if the metric is unsure, see `refine`
     tells_facing: bool = False
 
     def rounds_of(self, joint: int) -> int:

@@ -27,7 +27,7 @@ from liex_lab.estimation._feature_kernels import N_SCALARS
 from liex_lab.estimation._residual_kernels import N_FIT
 from liex_lab.estimation.cascade import Cascade
 from liex_lab.estimation.method import Method
-from liex_lab.estimation.ridge_correction import N_OTHERS
+from liex_lab.estimation.refine import N_OTHERS
 from liex_lab.forests._kernels import number_nodes
 from liex_lab.forests.forest import Forest, check_forest, check_roots
 from liex_lab.mlp import Network, check_layers
@@ -50,14 +50,8 @@ _DAMAGE = (
     zipfile.BadZipFile,
     lzma.LZMAError,
 )
-_EPOCH = (
-    1980,
-    1,
-    1,
-    0,
-    0,
-    0,
-)  # date of every file in the archive, so that equal models are equal bytes
+# date of every file in the archive, so that equal models are equal bytes
+_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -100,7 +94,7 @@ class Model:
         calibration: conversion of the metric's score to mm.
         card: provenance of the model.
         pruner: the small metric on the base joint only; None: nothing is pruned.
-        corrector: forest that corrects the joints of the chosen pose, see `forest_correction`.
+        corrector: forest that corrects the joints of the chosen pose, see `scoring`.
         settler: (F, J + 4) table of the ridge correction, if the method has one.
         facing: network of the head-tail classifier, if the method has one.
     """
@@ -158,8 +152,9 @@ class Model:
             arrays.update({f"{k:03d}_{name}": values for name, values in _split(forest).items()})
         if self.settler is not None:
             arrays["settler"] = self.settler
-        if self.facing is not None:
-            arrays.update(_layers(self.facing))
+        for k, layer in enumerate(self.facing.layers if self.facing else ()):
+            for name, values in zip(_LAYER_PARTS, layer, strict=True):
+                arrays[f"{_LAYER}{k}_{name}"] = values.astype(np.float16)
         packed = io.BytesIO()
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
             for name, values in arrays.items():
@@ -196,14 +191,18 @@ class Model:
                     _join({part: archive[f"{name}_{part}"] for part in _PARTS}) for name in names
                 ]
                 settler = archive["settler"] if "settler" in archive.files else None
-                facing = _network(archive) if f"{_LAYER}0_bias" in archive.files else None
+                n_layers = sum(name.startswith(_LAYER) for name in archive.files) // 2
+                layers = [
+                    [archive[f"{_LAYER}{k}_{name}"].astype(np.float32) for name in _LAYER_PARTS]
+                    for k in range(n_layers)
+                ]
+                facing = Network.plain(layers) if f"{_LAYER}0_bias" in archive.files else None
             method = Method.from_dict(head["method"])
             values = head["calibration"]
             for name in ("quantiles", "joint_share"):
                 values[name] = tuple(values[name])
             calibration = ErrorCalibration(**values)
-            table = head["skeleton"]
-            card = head["card"]
+            table, card = head["skeleton"], head["card"]
         except FileNotFoundError:
             raise ModelError(
                 f"there is no model file {path}; name a bundled model or the path of an .npz"
@@ -217,9 +216,8 @@ class Model:
         if any(type(n) is not int or n < 1 for n in rounds):
             raise ModelError(f"{path} states {rounds} rounds for its joints; train it again")
         n_regressors = sum(rounds)
-        extra = head.get(
-            "forests", _FORESTS[: len(forests) - n_regressors]
-        )  # schema 1 did not state it
+        # schema 1 did not state it
+        extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])
         if len(forests) != n_regressors + len(extra) or "metric" not in extra:
             raise ModelError(
                 f"{path} has {len(forests)} forests, not {n_regressors} and a metric; train it "
@@ -228,19 +226,15 @@ class Model:
         named = dict(zip(extra, forests[n_regressors:], strict=True))
         stops = np.cumsum(rounds).tolist()
         each = [forests[stop - n : stop] for n, stop in zip(rounds, stops, strict=True)]
-        metric, *others = (named.get(name) for name in _FORESTS)
-        assert metric is not None
-        expectation, pruner, corrector, proposals = others
-        cascade = Cascade(skeleton, method, each, proposals)
         model = Model(
-            cascade,
-            metric,
-            expectation,
+            Cascade(skeleton, method, each, named.get("proposals")),
+            named["metric"],
+            named.get("expectation"),
             table,
             calibration,
             card,
-            pruner,
-            corrector,
+            named.get("pruner"),
+            named.get("corrector"),
             settler,
             facing,
         )
@@ -349,29 +343,7 @@ _COUNTS = {
 }
 _N_PROPOSED = 12  # a rotation matrix and a position
 _LAYER = "facing_"
-
-
-def _layers(network: Network) -> dict[str, NDArray[Any]]:
-    """A network's layers as stored in the file; its features are not standardised."""
-    return {
-        f"{_LAYER}{k}_{name}": values.astype(np.float16)
-        for k, layer in enumerate(network.layers)
-        for name, values in zip(("weights", "bias"), layer, strict=True)
-    }
-
-
-def _network(archive: Any) -> Network:
-    """The inverse of `_layers`."""
-    n_layers = sum(name.startswith(_LAYER) for name in archive.files) // 2
-    layers = tuple(
-        (
-            archive[f"{_LAYER}{k}_weights"].astype(np.float32),
-            archive[f"{_LAYER}{k}_bias"].astype(np.float32),
-        )
-        for k in range(n_layers)
-    )
-    n = len(layers[0][0])
-    return Network(np.zeros(n, np.float32), np.ones(n, np.float32), layers)
+_LAYER_PARTS = ("weights", "bias")
 
 
 _KINDS = {

@@ -8,18 +8,24 @@ candidates near that one are averaged with weights
 rotations use the chordal mean, the polar projection of sum_i w_i R_i, or follow from the mean
 joints. A boosted forest then predicts the mean joint error of the chosen pose from its scores, its
 spread and the posture (the "expectation forest", ours).
+
+Candidates are moved by forests trained on initial poses; their weighted mean is none of them and
+has errors of its own. A small forest, grown by stochastic gradient boosting (Friedman 2002) on
+chosen poses of images that no other tree was grown on, predicts the residual x_j - x_j_hat of every
+joint j, in the base's frame, at home size, and corrects its predictable part (the "forest
+correction", ours). It is evaluated for one pose per frame, at negligible cost.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.forests._kernels import VIEW
@@ -30,26 +36,11 @@ from liex_lab.scene.height_maps import mm_per_px, moment_columns
 Array = NDArray[np.float64]
 
 LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
+_PIXEL_LOG_UNIT = 500.0  # of a scalar: a threshold is an integer
 # at the reference length: the least expected error, and the score of the opposite direction if no
 # candidate has it
 LEAST_MM = 0.1
 _NO_OPPOSITE_MM = 40.0
-
-
-class Doubts(NamedTuple):
-    """Evidence against the chosen poses (n,), mm at home size, in the order of `Chosen.doubts`.
-
-    Attributes:
-        best: the best score.
-        opposite: the best score of a candidate in the opposite direction.
-        score_sd: standard deviation of the good scores.
-        distance: mean distance of all candidates from the chosen pose.
-    """
-
-    best: Array
-    opposite: Array
-    score_sd: Array
-    distance: Array
 
 
 @dataclass(frozen=True)
@@ -66,7 +57,9 @@ class Chosen:
         error_mm: (n,) expected mean joint error, mm.
         score: (n,) weighted mean of the scores, mm at home size.
         spread: (n,) spread of the averaged candidates about the chosen pose, mm at home size.
-        doubts: (n, 4) the columns of `Doubts`.
+        doubts: (n, 4) evidence against the pose, mm at home size: the best score, the best score of
+            a candidate in the opposite direction, the standard deviation of the good scores, and
+            the mean distance of all candidates from the pose.
         fit: (n, F) residuals of the pose against the height map if the method uses them, else F =
             0, see `_residual_kernels.explain`.
         frame_scale: (n,) the animal's size over home size as estimated from this frame alone.
@@ -88,6 +81,20 @@ class Chosen:
     def __getitem__(self, rows: slice) -> Chosen:
         """A slice of the frames."""
         return Chosen(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def spread_over(self, usable: NDArray[np.bool_]) -> Chosen:
+        """These poses as the usable ones of n frames, in order; rows of NaN elsewhere."""
+
+        def rows(values: Array) -> Array:
+            """Rows of all frames, NaN where the frame is not usable."""
+            out = np.full((len(usable), *values.shape[1:]), np.nan)
+            out[usable] = values
+            return out
+
+        pose = self.pose
+        root = SE3(rows(pose.root.rotation), rows(pose.root.translation))
+        others = (rows(getattr(self, field.name)) for field in fields(self)[1:])
+        return Chosen(Pose(root, rows(pose.angles), rows(pose.scale)), *others)
 
 
 def choose(
@@ -142,12 +149,11 @@ def choose(
     )
     expected = np.maximum(expected, LEAST_MM * skeleton.relative_size) * size
     share = np.array(calibration.joint_share or (1.0,) * skeleton.n_joints)
-    sd_mm = (
-        expected[:, None] * share / np.sqrt(3.0)
-    )  # an error of three equal components, see columns.json
+    # of three equal components, see columns.json
+    sd_mm = expected[:, None] * share / np.sqrt(3.0)
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
-    doubts = _doubts(positions, scores, mean, score, size, _NO_OPPOSITE_MM * skeleton.relative_size)
-    fit = np.zeros((len(score), 0))
+    no_opposite_mm = _NO_OPPOSITE_MM * skeleton.relative_size
+    doubts = _doubts(positions, scores, mean, score, size, no_opposite_mm)
     return Chosen(
         pose,
         sd_root,
@@ -157,7 +163,7 @@ def choose(
         mean_score,
         spread,
         doubts,
-        fit,
+        np.zeros((len(score), 0)),
         pose.scale,
         -mean_score,
     )
@@ -190,13 +196,9 @@ def mean_pose(skeleton: Skeleton, turned: Array, joints: Array, weight: Array) -
     )
     angles = np.zeros((len(turned), skeleton.n_joints, 3))
     angles[:, moving] = np.einsum("nk,nkjd->njd", weight, so3.log(local)) * skeleton.axes[moving]
-    bones = np.linalg.norm(joints[:, :, 1:] - joints[:, :, skeleton.parents[1:]], axis=-1).sum(
-        axis=2
-    )
-    scale = (
-        np.einsum("nk,nk->n", weight, bones) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
-    )
-    return Pose(root, angles, scale)
+    bones = joints[:, :, 1:] - joints[:, :, skeleton.parents[1:]]
+    length = np.einsum("nk,nk->n", weight, np.linalg.norm(bones, axis=-1).sum(axis=2))
+    return Pose(root, angles, length / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum())
 
 
 def with_best(
@@ -247,19 +249,16 @@ def _doubts(
     backwards = np.einsum("nkd,nd->nk", along, mean[:, -1] - mean[:, 0]) < 0
     opposite = np.where(backwards, scores, no_opposite_mm).min(axis=1)
     distance = np.linalg.norm(positions - mean[:, None], axis=-1).mean(axis=(1, 2)) / size
-    return np.stack(Doubts(scores.min(axis=1), opposite, good.std(axis=1), distance), axis=1)
+    return np.stack([scores.min(axis=1), opposite, good.std(axis=1), distance], axis=1)
 
 
-def with_expected_error(
-    chosen: Chosen, model: Model, moments: Array, crop_cameras: Array, size: float
-) -> Chosen:
+def with_expected_error(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Chosen:
     """Replace the expected errors by predictions of the model's expectation forest.
 
     Args:
         chosen: n chosen poses.
         model: the model; without an expectation forest nothing changes.
-        moments: (n, 9) moments of the height maps.
-        crop_cameras: (n, 17) crop cameras of the height maps.
+        images: the n height maps.
         size: the animal's size over home size.
 
     Returns:
@@ -267,20 +266,15 @@ def with_expected_error(
     """
     if model.expectation is None or not len(chosen.score):
         return chosen
-    n = len(chosen.score)
-    samples = clue_samples(chosen, model.skeleton, moments, crop_cameras, size)
-    least = LEAST_MM * model.skeleton.relative_size
-    said = predict(model.expectation, samples)[:n, 0].astype(float)
-    error = (
-        np.maximum(np.exp(said / LOG_UNIT) if model.calibration.logarithmic else said, least) * size
-    )
-    scale = error / chosen.error_mm
-    return replace(chosen, error_mm=error, sd_mm=chosen.sd_mm * scale[:, None])
+    samples = clue_samples(chosen, model.skeleton, images, size)
+    error = predict(model.expectation, samples)[:, 0].astype(float)
+    if model.calibration.logarithmic:
+        error = np.exp(error / LOG_UNIT)
+    error = np.maximum(error, LEAST_MM * model.skeleton.relative_size) * size
+    return replace(chosen, error_mm=error, sd_mm=chosen.sd_mm * (error / chosen.error_mm)[:, None])
 
 
-def clue_samples(
-    chosen: Chosen, skeleton: Skeleton, moments: Array, crop_cameras: Array, size: float
-) -> Samples:
+def clue_samples(chosen: Chosen, skeleton: Skeleton, images: ImageSet, size: float) -> Samples:
     """Features of chosen poses for the expectation forest: numbers only, no depth.
 
     They are scores and doubts, the posture, the animal's visible size, roundness and height, the
@@ -290,8 +284,7 @@ def clue_samples(
     Args:
         chosen: n chosen poses.
         skeleton: the animal's skeleton.
-        moments: (n, 9) moments of the height maps.
-        crop_cameras: (n, 17) crop cameras of the height maps.
+        images: the n height maps.
         size: the animal's size over home size.
 
     Returns:
@@ -300,7 +293,7 @@ def clue_samples(
     pose = chosen.pose
     unit = skeleton.relative_size
     whole = size * skeleton.relative_size
-    blob = moment_columns(moments)
+    blob = moment_columns(images.moments)
     clues = np.stack(
         [
             chosen.score / unit,
@@ -314,7 +307,7 @@ def clue_samples(
             5 * np.log(np.maximum(blob.volume_mm3, 1.0) / size**3),
             blob.sd_along / whole,
             blob.sd_across / whole,
-            10 * (mm_per_px(crop_cameras) / whole),
+            10 * (mm_per_px(images.crop_cameras) / whole),
             *chosen.sd_root.T[:3] * 10,
             *chosen.sd_root.T[3:] / whole,
             10 * chosen.sd_angles.sum(axis=(1, 2)),
@@ -322,9 +315,14 @@ def clue_samples(
         ],
         axis=1,
     )
-    n = len(clues)
+    return blank_samples((100.0 * clues).astype(np.float32))
+
+
+def blank_samples(scalars: NDArray[np.float32]) -> Samples:
+    """Samples of scalars (n, F) alone, on one blank height map."""
+    n = len(scalars)
     blank = np.zeros((1, 2, 2), np.int16), np.zeros(n, np.int32), np.ones(n, np.float32)
-    return Samples(*blank, np.zeros((n, 1, VIEW), np.float32), (100.0 * clues).astype(np.float32))
+    return Samples(*blank, np.zeros((n, 1, VIEW), np.float32), scalars)
 
 
 def _spread_of_coordinates(
@@ -348,3 +346,58 @@ def _spread_of_coordinates(
         np.sqrt(np.einsum("nk,nkjd->njd", weight, turn**2)) * skeleton.axes[moving]
     )
     return sd_root, sd_angles
+
+
+# Forest correction of the chosen pose.
+
+
+def corrected(chosen: Chosen, model: Model, images: ImageSet, size: float) -> Chosen:
+    """Apply the model's forest correction to chosen poses.
+
+    Args:
+        chosen: n chosen poses, view frame.
+        model: the model; without a corrector the poses are unchanged.
+        images: the n height maps.
+        size: the animal's size over home size.
+
+    Returns:
+        The choices with corrected poses; scores and errors are kept.
+    """
+    if model.corrector is None or not len(chosen.score):
+        return chosen
+    frames = chosen.pose.frames(model.skeleton)
+    moves = predict(model.corrector, pose_samples(chosen.pose, model, images, size)).astype(float)
+    moves = size * moves.reshape(len(moves), -1, 3)
+    base = frames.rotation[:, 0]
+    joints = frames.translation + np.einsum("nij,nkj->nki", base, moves)
+    return replace(chosen, pose=Pose.from_joints(model.skeleton, joints, base[:, :, 2]))
+
+
+def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Samples:
+    """Features of one pose per height map for the corrector.
+
+    They are the views from all joints, the scalars of every forest, and the logarithm of the size
+    of a pixel in mm, as an outline loses about a pixel on all sides.
+
+    Args:
+        pose: (n) poses, view frame.
+        model: its cascade computes the features.
+        images: the n height maps.
+        size: the animal's size over home size.
+
+    Returns:
+        n samples with J views.
+    """
+    frames = pose.frames(model.skeleton)
+    n = len(pose.scale)
+    candidates = Candidates(
+        np.arange(n, dtype=np.int32),
+        frames.rotation,
+        frames.translation,
+        pose.scale,
+        np.full(n, size),
+    )
+    samples = model.cascade.samples(images, candidates, list(range(model.skeleton.n_joints)))
+    pixel = mm_per_px(images.crop_cameras) / size
+    scalars = np.column_stack([samples.scalars, _PIXEL_LOG_UNIT * np.log(pixel)]).astype(np.float32)
+    return replace(samples, scalars=scalars)

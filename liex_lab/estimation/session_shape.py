@@ -28,8 +28,8 @@ from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface, joint_reaches
 from liex_lab.estimation import _feature_kernels as kernels
+from liex_lab.estimation.refine import ridge_regression
 from liex_lab.geometry import SE3
-from liex_lab.runtime.shapes import check_shapes
 from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]
@@ -51,87 +51,43 @@ _MARGIN = 2  # stations at either end that are past the body
 _LEAST_WIDTH = 0.05  # of the default body's: thinner, a station shows nothing
 
 
-@dataclass(frozen=True)
-class CrossSections:
+def cross_sections(
+    skeleton: Skeleton, pose: Pose, heights: NDArray[np.int16], crop_cameras: Array, size: float
+) -> tuple[Array, Array, float]:
     """Mean cross-sections over the frames of one animal, lengths over the animal's own.
 
-    Attributes:
-        seen: (S, T) share of the frames in which the animal is there, both sides together.
-        height: (S, T) mean height over the mid-axis, if it is there.
-        step: distance between lateral positions.
+    Args:
+        skeleton: of the animal, one chain with a tube as its surface.
+        pose: (n) poses, view frame, at least one.
+        heights: (n, H, W) int16 height maps, 1/16 mm.
+        crop_cameras: (n, 17) packed crop cameras of the height maps.
+        size: the animal's size over home size.
+
+    Returns:
+        The share (S, T) of the frames in which the animal is at a station and a lateral position,
+        both sides together; its mean height (S, T) over the mid-axis, if it is there; and the
+        distance between lateral positions.
     """
-
-    seen: Array
-    height: Array
-    step: float
-
-    @staticmethod
-    def of(
-        skeleton: Skeleton,
-        pose: Pose,
-        heights: NDArray[np.int16],
-        crop_cameras: Array,
-        size: float,
-    ) -> CrossSections:
-        """The mean cross-sections around estimated poses.
-
-        Args:
-            skeleton: of the animal, one chain with a tube as its surface.
-            pose: (n) poses, view frame, at least one.
-            heights: (n, H, W) int16 height maps, 1/16 mm.
-            crop_cameras: (n, 17) packed crop cameras of the height maps.
-            size: the animal's size over home size.
-        """
-        joints = pose.joints(skeleton)
-        n = len(joints)
-        check_shapes("poses", ("heights", heights, (n, "H", "W")))
-        points, sideways = _stations(skeleton, joints)
-        reach = _REACH * float(BodyShape.default(skeleton).half_width.max()) * size
-        lateral = (np.arange(N_LATERAL) + 0.5) / N_LATERAL * reach
-        seen = np.empty((n, N_STATIONS, N_LATERAL))
-        height = np.empty_like(seen)
-        kernels.read_across(heights, crop_cameras, points, sideways, lateral, seen, height)
-        length = skeleton.length * size
-        shown = seen.sum(axis=0)
-        mean = (seen * height).sum(axis=0) / np.maximum(shown, 0.5) / length
-        return CrossSections(shown / n, mean, reach / N_LATERAL / length)
-
-    @property
-    def half_width(self) -> Array:
-        """(S,) mean half width at the stations."""
-        return np.asarray(self.seen.sum(axis=1) * self.step)
-
-    def clues(self, skeleton: Skeleton) -> Array:
-        """Input of the regression about the animal's build.
-
-        They are the half widths, the height of the back over the mid-axis and its decline towards
-        its edge in groups of stations, and the blur of the outline.
-
-        Args:
-            skeleton: of the animal.
-
-        Returns:
-            (F,) numbers, lengths over the animal's own.
-        """
-        width = self.half_width
-        least = _LEAST_WIDTH * BodyShape.default(skeleton).half_width.max() / skeleton.length
-        lateral = (np.arange(N_LATERAL) + 0.5) * self.step
-        across = self.height.copy()
-        for t in range(1, N_LATERAL):  # cells that are rarely visible continue the back level
-            across[:, t] = np.where(self.seen[:, t] < _HARDLY, across[:, t - 1], across[:, t])
-        back = np.zeros((N_STATIONS, len(_PLACES)))
-        for s in np.flatnonzero(width > least):
-            back[s] = np.interp(np.array(_PLACES) * width[s], lateral, across[s])
-        fall = back[:, :1] - back[:, 1:]
-        torn = (self.seen > _HARDLY) & (self.seen < 1.0 - _HARDLY)
-        return np.concatenate(
-            [
-                width,
-                _grouped(back[:, :1], width, _BACKS),
-                _grouped(fall, width, _FALLS),
-                [torn.mean()],
-            ]
-        )
+    joints = pose.joints(skeleton)
+    n = len(joints)
+    ends = joint_reaches(skeleton)
+    at = np.linspace(_FROM, _TO, N_STATIONS)
+    bone = np.clip(np.searchsorted(ends, at, side="right") - 1, 0, len(ends) - 2)
+    share = ((at - ends[bone]) / (ends[bone + 1] - ends[bone]))[:, None]
+    along = joints[:, bone + 1] - joints[:, bone]
+    # on the mid-axis, and unit vectors across it in the image
+    points = np.ascontiguousarray(joints[:, bone] + share * along)
+    sideways = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    sideways /= np.maximum(np.linalg.norm(sideways, axis=-1, keepdims=True), 1e-9)
+    reach = _REACH * float(BodyShape.default(skeleton).half_width.max()) * size
+    lateral = (np.arange(N_LATERAL) + 0.5) / N_LATERAL * reach
+    covered = np.empty((n, N_STATIONS, N_LATERAL))
+    height = np.empty_like(covered)
+    kernels.read_across(heights, crop_cameras, points, sideways, lateral, covered, height)
+    length = skeleton.length * size
+    shown = covered.sum(axis=0)
+    mean = (covered * height).sum(axis=0) / np.maximum(shown, 0.5) / length
+    return shown / n, mean, reach / N_LATERAL / length
 
 
 def _grouped(values: Array, weight: Array, n: int) -> Array:
@@ -140,19 +96,6 @@ def _grouped(values: Array, weight: Array, n: int) -> Array:
     return np.concatenate(
         [weight[g] @ values[g] / max(float(weight[g].sum()), 1e-9) for g in groups]
     )
-
-
-def _stations(skeleton: Skeleton, joints: Array) -> tuple[Array, Array]:
-    """Points (n, S, 3) on the mid-axis, and unit vectors (n, S, 2) across it in the image."""
-    reach = joint_reaches(skeleton)
-    at = np.linspace(_FROM, _TO, N_STATIONS)
-    bone = np.clip(np.searchsorted(reach, at, side="right") - 1, 0, len(reach) - 2)
-    share = ((at - reach[bone]) / (reach[bone + 1] - reach[bone]))[:, None]
-    along = joints[:, bone + 1] - joints[:, bone]
-    points = joints[:, bone] + share * along
-    sideways = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    sideways /= np.maximum(np.linalg.norm(sideways, axis=-1, keepdims=True), 1e-9)
-    return np.ascontiguousarray(points), np.ascontiguousarray(sideways)
 
 
 PLACES = (0.1, 0.25, 0.4, 0.6, 0.8)  # of the body's length
@@ -168,6 +111,9 @@ def session_clues(
 ) -> Array:
     """Evidence about the animal's build from all frames of a session.
 
+    It is the half widths, the height of the back over the mid-axis and its decline towards its edge
+    in groups of stations, the blur of the outline, and the size of a pixel and that of the bones.
+
     Args:
         skeleton: of the animal, one chain with a tube as its surface.
         pose: (n) estimated poses, view frame, at least one.
@@ -176,13 +122,28 @@ def session_clues(
         size: the animal's size over home size used for the poses.
 
     Returns:
-        (F,) numbers, see `CrossSections.clues`, then the size of a pixel and that of the bones over
-        the animal's.
+        (F,) numbers, lengths over the animal's own.
     """
-    across = CrossSections.of(skeleton, pose, heights, crop_cameras, size)
-    pixel = float(np.median(mm_per_px(crop_cameras))) / (skeleton.length * size)
-    bones = float(np.log(np.median(pose.scale) / size))
-    return np.concatenate([across.clues(skeleton), [pixel, bones]])
+    covered, across, step = cross_sections(skeleton, pose, heights, crop_cameras, size)
+    width = covered.sum(axis=1) * step
+    least = _LEAST_WIDTH * BodyShape.default(skeleton).half_width.max() / skeleton.length
+    lateral = (np.arange(N_LATERAL) + 0.5) * step
+    for t in range(1, N_LATERAL):  # cells that are rarely visible continue the back level
+        across[:, t] = np.where(covered[:, t] < _HARDLY, across[:, t - 1], across[:, t])
+    back = np.zeros((N_STATIONS, len(_PLACES)))
+    for s in np.flatnonzero(width > least):
+        back[s] = np.interp(np.array(_PLACES) * width[s], lateral, across[s])
+    torn = (covered > _HARDLY) & (covered < 1.0 - _HARDLY)
+    return np.concatenate(
+        [
+            width,
+            _grouped(back[:, :1], width, _BACKS),
+            _grouped(back[:, :1] - back[:, 1:], width, _FALLS),
+            [torn.mean()],
+            [float(np.median(mm_per_px(crop_cameras))) / (skeleton.length * size)],
+            [float(np.log(np.median(pose.scale) / size))],
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -253,9 +214,10 @@ class ShapePrior:
         fold = np.arange(len(x)) % _FOLDS
         left = np.empty_like(labels)
         for k in range(_FOLDS):
-            table = _ridge(x[fold != k], labels[fold != k])
-            left[fold == k] = labels[fold == k] - (x[fold == k] @ table[:-1] + table[-1])
-        return ShapePrior(bounds, _ridge(x, labels), left.std(axis=0))
+            weights, constant = ridge_regression(x[fold != k], labels[fold != k], _RIDGE, 1e-9)
+            left[fold == k] = labels[fold == k] - (x[fold == k] @ weights + constant)
+        table = np.vstack(ridge_regression(x, labels, _RIDGE, 1e-9))
+        return ShapePrior(bounds, table, left.std(axis=0))
 
     def predict(self, clues: Array) -> Array:
         """The labels of sessions.
@@ -268,19 +230,6 @@ class ShapePrior:
         """
         x = np.clip(clues, *self.bounds)
         return np.asarray((x @ self.table[:-1] + self.table[-1]).round(_DECIMALS))
-
-
-def _ridge(x: Array, y: Array) -> Array:
-    """Weights (F + 1, K) of a ridge regression on standardised clues, the constant last."""
-    middle = x.mean(axis=0)
-    spread = x.std(axis=0)
-    per = np.where(spread > 1e-9, 1.0 / np.maximum(spread, 1e-9), 0.0)
-    z = (x - middle) * per
-    weights = np.linalg.solve(
-        z.T @ z + _RIDGE * len(z) * np.eye(z.shape[1]), z.T @ (y - y.mean(axis=0))
-    )
-    weights *= per[:, None]
-    return np.vstack([weights, y.mean(axis=0) - middle @ weights])
 
 
 def labels_of(offset: Array, width: Array, height: Array) -> Array:
@@ -314,16 +263,6 @@ class Build:
     width_sd: Array
     height_sd: Array
     unseen: tuple[float, float]
-
-    @staticmethod
-    def from_clues(prior: ShapePrior, clues: Array) -> Build:
-        """The build estimated from a session's clues.
-
-        Args:
-            prior: of the animal.
-            clues: (F,) of the session, see `session_clues`.
-        """
-        return Build.of(prior, prior.predict(clues))
 
     @staticmethod
     def of(prior: ShapePrior, labels: Array) -> Build:
@@ -370,14 +309,6 @@ class Build:
         whole.angles[rows] = right.angles
         whole.scale[rows] = right.scale
         return whole
-
-    def surface(self, skeleton: Skeleton) -> Surface:
-        """The body of this build.
-
-        Args:
-            skeleton: of the animal, with a tube as its surface.
-        """
-        return built(skeleton, self.width, self.height)
 
 
 def built(

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.tracking.track import spans
+
 if TYPE_CHECKING:
     from liex_lab.simulation.corruptions import Event
     from liex_lab.simulation.scenes.recording import TrueAnimal
@@ -239,11 +241,7 @@ class Followed:
     @property
     def longest_flip(self) -> int:
         """Most flipped frames in a row."""
-        longest = run = 0
-        for off in self.flipped:
-            run = run + 1 if off else 0
-            longest = max(longest, run)
-        return longest
+        return max((stop - start for start, stop in spans(self.flipped)), default=0)
 
     @property
     def inside(self) -> Mask:
@@ -252,9 +250,7 @@ class Followed:
 
     @property
     def covered(self) -> Mask:
-        """(m,) bool, `inside` of the joint coordinates with both a pose and a standard
-        deviation.
-        """
+        """(m,) bool, `inside` of the coordinates with both a pose and a standard deviation."""
         return self.inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)]
 
     def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
@@ -339,7 +335,7 @@ def tracking_figures(
 
 
 @dataclass(frozen=True)
-class Individual:
+class MeasuredIndividual:
     """One individual of a session in n frames.
 
     Attributes:
@@ -380,7 +376,7 @@ class Tally:
     def add(
         self,
         truths: Sequence[TrueAnimal],
-        individuals: Sequence[Individual],
+        individuals: Sequence[MeasuredIndividual],
         n_frames: int,
         tip: int = -1,
         fits: bool = True,
@@ -402,24 +398,23 @@ class Tally:
             self.trusted += trusted
             self.wrong += 0 if k in pairs.values() else trusted
         for t, truth in enumerate(truths if fits else ()):
-            self._add_animal(truth, individuals[pairs[t]] if t in pairs else None, tip)
-
-    def _add_animal(self, truth: TrueAnimal, one: Individual | None, tip: int) -> None:
-        there = np.isfinite(truth.joints_camera).all(axis=(1, 2))
-        view = there & (truth.visible >= IN_VIEW)
-        hidden = there & (truth.visible <= HIDDEN)
-        self.in_view += int(view.sum())
-        self.hidden += int(hidden.sum())
-        if one is None:
-            self.hidden_right += int(hidden.sum())
-            return
-        error = error_of(one.joints_camera, truth.joints_camera)
-        rows = view & np.isfinite(one.joints_camera).all(axis=(1, 2))
-        self.found += int(rows.sum())
-        self.hidden_right += int((hidden & ~one.trusted).sum())
-        self.wrong += int((one.trusted & ~(error <= FAR * truth.spine_mm)).sum())
-        self.errors_mm.append(error[rows])
-        self.flipped.append(is_flipped(one.joints_camera[rows], truth.joints_camera[rows], tip))
+            there = np.isfinite(truth.joints_camera).all(axis=(1, 2))
+            view = there & (truth.visible >= IN_VIEW)
+            hidden = there & (truth.visible <= HIDDEN)
+            self.in_view += int(view.sum())
+            self.hidden += int(hidden.sum())
+            if t not in pairs:
+                self.hidden_right += int(hidden.sum())
+                continue
+            one = individuals[pairs[t]]
+            error = error_of(one.joints_camera, truth.joints_camera)
+            rows = view & np.isfinite(one.joints_camera).all(axis=(1, 2))
+            self.found += int(rows.sum())
+            self.hidden_right += int((hidden & ~one.trusted).sum())
+            self.wrong += int((one.trusted & ~(error <= FAR * truth.spine_mm)).sum())
+            self.errors_mm.append(error[rows])
+            joints, true = one.joints_camera[rows], truth.joints_camera[rows]
+            self.flipped.append(is_flipped(joints, true, tip))
 
     def figures(self) -> dict[str, Any]:
         """Results of the scene, see `SCENES_PROTOCOL`; None for those without frames."""
@@ -437,7 +432,9 @@ class Tally:
         }
 
 
-def matched(truths: Sequence[TrueAnimal], individuals: Sequence[Individual]) -> dict[int, int]:
+def matched(
+    truths: Sequence[TrueAnimal], individuals: Sequence[MeasuredIndividual]
+) -> dict[int, int]:
     """Assign individuals to true animals by the least sum of errors (Hungarian method).
 
     An error is capped at a spine's length, which is also the error of a missing pose.

@@ -57,6 +57,13 @@ class Forest:
         """Number of trees."""
         return len(self.roots)
 
+    def quantised(self) -> Forest:
+        """The forest with leaves rounded to float16, the precision of the model file, so that
+        training uses the same forest as estimation.
+        """
+        leaves = self.leaves.astype(np.float16).astype(np.float32)
+        return Forest(self.nodes, self.roots, leaves)
+
     @staticmethod
     def pack(trees: list[tuple[NDArray[np.int32], NDArray[np.float32]]]) -> Forest:
         """Pack trees into one forest.

@@ -274,8 +274,7 @@ def reversed_pose(skeleton: Skeleton, pose: Pose) -> Pose:
     """
     joints = pose.joints(skeleton)
     up = pose.root.rotation[:, :, 2]
-    bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
-    reach = np.concatenate([[0.0], np.cumsum(bones)])
+    reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(skeleton.offsets[1:], axis=1))])
     turned = np.empty_like(joints)
     for i, line in enumerate(joints):
         along = reach[-1] - reach[::-1]

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
-from liex_lab.runtime.shapes import check_shapes
 from liex_lab.scene.height_maps import HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
 
@@ -39,9 +38,7 @@ def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
     Returns:
         (n,) 0 to 1; 0 if nothing was found.
     """
-    n = len(crops.n_px)
-    check_shapes("frames", ("depths", depths, (n, "H", "W")))
-    out = np.zeros(n)
+    out = np.zeros(len(crops.n_px))
     _share_behind(crops.heights, crops.origin, crops.step, depths, _NEARER_MM, _REACH_PX, out)
     return out
 
@@ -164,34 +161,25 @@ class OcclusionCorrection:
             (n) poses, camera frame; unchanged if nothing is hidden or the hidden end is unknown.
         """
         joints = joints_of(self.skeleton, pose)
-        sight = self._sight(joints, crops, depths)
-        shown, covered, aside, begins, ends = sight.T
+        shown, covered, aside, begins, ends = self._sight(joints, crops, depths).T
         most = _SLIDE * np.clip(1.0 - shown, 0.0, 1.0)
-        direction = np.where(
-            aside > 0,
-            np.clip(begins - self.begins, 0.0, most),
-            np.clip(ends - self.ends, -most, 0.0),
-        )
+        forwards = np.clip(begins - self.begins, 0.0, most)
+        direction = np.where(aside > 0, forwards, np.clip(ends - self.ends, -most, 0.0))
         direction[(covered == 0) | (np.abs(aside) < _ASIDE) | (shown > _WHOLE)] = 0.0
         along = joints[:, self.skeleton.tip] - joints[:, 0]
-        return replace(
-            pose, root=SE3(pose.root.rotation, pose.root.translation + direction[:, None] * along)
-        )
+        place = pose.root.translation + direction[:, None] * along
+        return replace(pose, root=SE3(pose.root.rotation, place))
 
     def _sight(self, joints: Array, crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
         """The visible part (n, 5) of each animal, see `_look`, with its area over the usual one.
 
         Its joints (n, J, 3) mm are in the camera frame.
         """
-        ends = self.scene.camera.project(joints[:, [0, self.skeleton.tip]])
-        n = len(ends)
-        check_shapes(
-            "poses", ("heights", crops.heights, (n, "S", "S")), ("depths", depths, (n, "H", "W"))
-        )
+        camera = self.scene.camera
+        ends = camera.project(joints[:, [0, self.skeleton.tip]])
         out = np.zeros((len(ends), 5))
         before = _BEFORE * float(np.sqrt(self.scene.area_mm2))
         _look(crops.heights, crops.origin, crops.step, crops.distance, depths, ends, before, out)
-        camera = self.scene.camera
         out[:, 0] /= camera.fx * camera.fy * self.scene.area_mm2
         return out
 

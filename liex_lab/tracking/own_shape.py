@@ -23,9 +23,16 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.estimation.session_shape import PLACES, Build, ShapePrior, session_clues
+from liex_lab.estimation.session_shape import (
+    PLACES,
+    Build,
+    ShapePrior,
+    built,
+    session_clues,
+)
 from liex_lab.scene.height_maps import Segmenter, view_of
 from liex_lab.tracking.residual import BodyResidual
+from liex_lab.tracking.trust import finite_median
 
 Array = NDArray[np.float64]
 
@@ -81,18 +88,22 @@ class OwnShape:
 
     def to_dict(self) -> dict[str, Any]:
         """The shape for session.json."""
-        told: dict[str, Any] = {
-            "kept": self.build is not None,
+        build = self.build
+        average, own = (
+            round(mm, 4) if np.isfinite(mm) else None
+            for mm in (self.average_residual_mm, self.residual_mm)
+        )
+        table: dict[str, Any] = {
+            "kept": build is not None,
             "n_frames": self.n_frames,
-            "average_residual_mm": _rounded(self.average_residual_mm),
-            "residual_mm": _rounded(self.residual_mm),
+            "average_residual_mm": average,
+            "residual_mm": own,
             **({"shared_by": self.shared_by} if self.shared_by else {}),
         }
-        if self.build is None:
-            return {**told, "why": self.why}
-        build = self.build
+        if build is None:
+            return {**table, "why": self.why}
         return {
-            **told,
+            **table,
             "places": list(PLACES),
             "width": build.width.round(3).tolist(),
             "width_sd": build.width_sd.round(3).tolist(),
@@ -100,10 +111,6 @@ class OwnShape:
             "height_sd": build.height_sd.round(3).tolist(),
             "joints_moved": build.offset.round(4).tolist(),
         }
-
-
-def _rounded(value: float) -> float | None:
-    return round(value, 4) if np.isfinite(value) else None
 
 
 def fit_shape(
@@ -134,38 +141,53 @@ def fit_shape(
         return None, average
     limit = estimator.model.calibration.doubtful_mm * size
     good = np.flatnonzero(estimates.found & ~(estimates.chosen.error_mm > limit))
+    why = ""
     if prior.model != estimator.model.fingerprint:
         why = f"shapes were learned for the bundled model of the {skeleton.name} alone"
-        return OwnShape(None, len(good), why=why), average
-    frames = _Frames(estimator, scene, estimates, size)
-    if stated is not None:
-        if stated.labels is None:
-            why = f"of {stated.by} too few bear out another, and they share it"
-            return OwnShape(None, len(good), why=why, shared_by=stated.by), average
-        build = Build.of(prior, stated.labels)
-        own = frames.at_best_girth(build, good, average.camera_view)
-        before, after = frames.residuals(average, good), frames.residuals(own, good, build)
-        mm = _median(before), _median(after)
-        return OwnShape(build, len(good), *mm, shared_by=stated.by), own
-    if len(good) < FEWEST_FRAMES:
+        stated = None
+    elif stated is not None and stated.labels is None:
+        why = f"of {stated.by} too few bear out another, and they share it"
+    elif stated is None and len(good) < FEWEST_FRAMES:
         why = (
             f"{len(good)} frames of the sample show the animal well, and a shape of its own is "
             f"fitted to {FEWEST_FRAMES} or more"
         )
-        return OwnShape(None, len(good), why=why), average
-    held_out = good[::_HELD_OUT]
-    fitted = np.setdiff1d(good, held_out)
-    build = Build.from_clues(prior, frames.clues(fitted))
-    own = frames.at_best_girth(build, fitted, average.camera_view)
-    before, after = frames.residuals(average, held_out), frames.residuals(own, held_out, build)
-    mm = _median(before), _median(after)
-    if not borne_out(before, after):
+    by = "" if stated is None else stated.by
+    if why:
+        return OwnShape(None, len(good), why=why, shared_by=by), average
+    camera_view = average.camera_view
+
+    def poses(rows: NDArray[np.int64], build: Build | None = None) -> Pose:
+        """Poses (n), arena frame, corrected for a build if there is one."""
+        pose = estimates.chosen.pose[rows]
+        pose = pose if build is None else build.corrected(skeleton, pose, size)
+        return pose.moved(scene.floor.T_arena_camera)
+
+    if stated is None or stated.labels is None:
+        held_out = good[::_HELD_OUT]
+        fitted = np.setdiff1d(good, held_out)
+        cameras = scene.crop_cameras(estimates.crops, camera_view)[fitted]
+        pose = estimates.chosen.pose[fitted].moved(view_of(cameras))
+        heights = estimates.crops.heights[fitted]
+        labels = prior.predict(session_clues(skeleton, pose, heights, cameras, size))
+    else:
+        held_out, fitted, labels = good, good, stated.labels
+    build = Build.of(prior, labels)
+    surface = built(skeleton, build.width, build.height)
+    own = BodyResidual.fit(
+        surface, poses(fitted, build), estimates.crops[fitted], scene, camera_view, size
+    )
+    crops = estimates.crops[held_out]
+    before = average.of(poses(held_out), crops, scene)
+    after = own.of(poses(held_out, build), crops, scene)
+    mm = finite_median(before, np.nan), finite_median(after, np.nan)
+    if stated is None and not borne_out(before, after):
         why = (
             "on frames that were held out a body of its own leaves "
             f"{mm[1]:.2f} mm to the depth and the average one {mm[0]:.2f} mm"
         )
         return OwnShape(None, len(good), *mm, why), average
-    return OwnShape(build, len(good), *mm), own
+    return OwnShape(build, len(good), *mm, shared_by=by), own
 
 
 def borne_out(before: Array, after: Array) -> bool:
@@ -178,58 +200,11 @@ def borne_out(before: Array, after: Array) -> bool:
     Returns:
         True if the median decreases, or if the mean decrease per frame is above zero.
     """
-    if _median(after) < _median(before):
+    if finite_median(after, np.nan) < finite_median(before, np.nan):
         return True
     fallen = before - after
     fallen = fallen[np.isfinite(fallen)]
     return bool(len(fallen)) and float(fallen.mean()) > 0.0
-
-
-@dataclass(frozen=True)
-class _Frames:
-    """The sampled frames, or some of them (`rows`); see `fit_shape`."""
-
-    estimator: PoseEstimator
-    scene: Segmenter
-    estimates: Estimates
-    size: float
-
-    def clues(self, rows: NDArray[np.int64]) -> Array:
-        """(F,) clues to the animal's build."""
-        camera_view = self.estimator.model.method.camera_view
-        cameras = self.scene.crop_cameras(self.estimates.crops, camera_view)[rows]
-        pose = self.estimates.chosen.pose[rows].moved(view_of(cameras))
-        heights = self.estimates.crops.heights[rows]
-        return session_clues(self.estimator.skeleton, pose, heights, cameras, self.size)
-
-    def at_best_girth(
-        self, build: Build, rows: NDArray[np.int64], camera_view: bool
-    ) -> BodyResidual:
-        """The body of a build at its best girth, like the average body."""
-        surface = build.surface(self.estimator.skeleton)
-        crops = self.estimates.crops[rows]
-        return BodyResidual.fit(
-            surface, self._pose(rows, build), crops, self.scene, camera_view, self.size
-        )
-
-    def residuals(
-        self, body: BodyResidual, rows: NDArray[np.int64], build: Build | None = None
-    ) -> Array:
-        """Residuals (n,) mm of a body, NaN unknown, in the poses that are corrected for a build."""
-        return body.of(self._pose(rows, build), self.estimates.crops[rows], self.scene)
-
-    def _pose(self, rows: NDArray[np.int64], build: Build | None) -> Pose:
-        """Poses (n), arena frame, corrected for a build if there is one."""
-        pose = self.estimates.chosen.pose[rows]
-        if build is not None:
-            pose = build.corrected(self.estimator.skeleton, pose, self.size)
-        return pose.moved(self.scene.floor.T_arena_camera)
-
-
-def _median(residual: Array) -> float:
-    """Median over the frames, mm; NaN if nothing is covered."""
-    known = residual[np.isfinite(residual)]
-    return float(np.median(known)) if len(known) else float("nan")
 
 
 # One body for the sessions of one animal: a random-effects mean of the individual estimates.
@@ -240,7 +215,7 @@ _LEAST_SD = 0.001  # of the length: smallest standard deviation of a session's e
 
 
 @dataclass(frozen=True)
-class Found:
+class SessionBody:
     """The estimates of one session about its animal.
 
     Attributes:
@@ -251,7 +226,7 @@ class Found:
         girth: of the average body; unused if a shape was kept.
         shape: (K,) labels of the kept shape, see `session_shape.labels_of`; None if there is none.
         refused: whether held-out frames contradicted the fitted shape.
-        n_well_seen: frames that show the animal well.
+        n_good_frames: frames that show the animal well.
     """
 
     spine_mm: float
@@ -261,16 +236,11 @@ class Found:
     girth: float = 1.0
     shape: Array | None = None
     refused: bool = False
-    n_well_seen: int = 0
-
-    @property
-    def variance(self) -> float:
-        """Variance of the logarithm of the length, from the scatter of its own frames only."""
-        return max(self.log_sd**2 / max(self.n_frames, 1), _LEAST_SD**2)
+    n_good_frames: int = 0
 
 
 @dataclass(frozen=True)
-class Agreed:
+class AgreedBody:
     """The shared values of the sessions of one animal.
 
     Attributes:
@@ -284,7 +254,7 @@ class Agreed:
     shape: Array | None
 
 
-def spread_of(found: Sequence[Found]) -> float:
+def spread_of(found: Sequence[SessionBody]) -> float:
     """The spread of the lengths: largest minus smallest, over the median.
 
     Args:
@@ -294,45 +264,38 @@ def spread_of(found: Sequence[Found]) -> float:
     return (max(lengths) - min(lengths)) / float(np.median(lengths))
 
 
-def agree(found: Sequence[Found]) -> Agreed:
+def agree(found: Sequence[SessionBody]) -> AgreedBody:
     """The shared values of sessions, independent of their order.
 
     Args:
         found: of sessions of one animal whose lengths are at most `MOST_APART` apart.
     """
-    measured = [one for one in found if not one.stated]
-    shape = _shape(found)
+    kept = [(one.shape, float(one.n_good_frames)) for one in found if one.shape is not None]
+    shape = girth = None
+    if sum(n for _, n in kept) > sum(one.n_good_frames for one in found if one.refused):
+        columns = zip(*(labels.tolist() for labels, _ in kept), strict=True)
+        shape = np.array([_mean(column, [n for _, n in kept]) for column in columns])
     average = [one for one in found if one.shape is None]
-    girth = None
     if shape is None and average:
         girth = _mean([one.girth for one in average], [float(one.n_frames) for one in average])
-    return Agreed(_length(measured) if measured else None, girth, shape)
+    measured = [one for one in found if not one.stated]
+    return AgreedBody(_length(measured) if measured else None, girth, shape)
 
 
-def _length(measured: Sequence[Found]) -> float:
+def _length(measured: Sequence[SessionBody]) -> float:
+    """The random-effects mean of the lengths; their logarithms have a variance from the scatter of
+    each session's own frames, and one between sessions, by the method of moments.
+    """
     y = [math.log(one.spine_mm) for one in measured]
-    variance = [one.variance for one in measured]
-    between = _between(y, [1.0 / v for v in variance])
-    return math.exp(_mean(y, [1.0 / (v + between) for v in variance]))
-
-
-def _between(y: Sequence[float], v: Sequence[float]) -> float:
-    """The variance between sessions, t^2, by the method of moments."""
-    m = _mean(y, v)
-    q = math.fsum(v_i * (y_i - m) ** 2 for y_i, v_i in zip(y, v, strict=True))
-    whole = math.fsum(v)
-    per = whole - math.fsum(v_i**2 for v_i in v) / whole
-    return max(0.0, (q - (len(y) - 1)) / per) if len(y) > 1 else 0.0
-
-
-def _shape(found: Sequence[Found]) -> Array | None:
-    kept = [(one.shape, one.n_well_seen) for one in found if one.shape is not None]
-    n_against = sum(one.n_well_seen for one in found if one.refused)
-    if sum(n for _, n in kept) <= n_against:
-        return None
-    weights = [float(n) for _, n in kept]
-    columns = zip(*(shape.tolist() for shape, _ in kept), strict=True)
-    return np.array([_mean(column, weights) for column in columns])
+    own = [max(one.log_sd**2 / max(one.n_frames, 1), _LEAST_SD**2) for one in measured]
+    between = 0.0
+    if len(y) > 1:
+        v = [1.0 / variance for variance in own]
+        m = _mean(y, v)
+        q = math.fsum(v_i * (y_i - m) ** 2 for y_i, v_i in zip(y, v, strict=True))
+        whole = math.fsum(v)
+        between = max(0.0, (q - (len(y) - 1)) / (whole - math.fsum(v_i**2 for v_i in v) / whole))
+    return math.exp(_mean(y, [1.0 / (variance + between) for variance in own]))
 
 
 def _mean(values: Sequence[float], weights: Sequence[float]) -> float:

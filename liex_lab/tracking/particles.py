@@ -17,7 +17,7 @@ is kept for the evaluation tables; the default tracker is `curve` (`offline`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ class ProcessNoise:
 
         Between two frames a fish moves and turns three times as far as a mouse, relative to its
         length. Those of the paper's variant were found by `liex train tracking --particles` on
-        development sequences, see `searched`.
+        development sequences, see `SEARCHED`.
 
         Args:
             name: name of the skeleton; 'fish' has its own, all others the default.
@@ -71,35 +71,15 @@ class ProcessNoise:
             The parameters; the animal's own if none were searched for the variant.
         """
         own = ProcessNoise(turn_rad=0.45, shift_mm=12.0) if name == "fish" else ProcessNoise()
-        return _SEARCHED.get((name, variant, base_rounds), own)
-
-    @staticmethod
-    def searched(name: str, variant: str, base_rounds: int) -> bool:
-        """Whether the parameters of an animal and a variant were searched, not set by hand.
-
-        Args:
-            name: name of the skeleton.
-            variant: variant of the regressors and the metric.
-            base_rounds: rounds of the base joint.
-        """
-        return (name, variant, base_rounds) in _SEARCHED
+        return SEARCHED.get((name, variant, base_rounds), own)
 
 
 # by animal, variant and rounds of the base joint: the best of a pattern search on the first 60
 # frames of 16 sequences, `liex train tracking --particles --animal mouse --frames 60`
-_SEARCHED: dict[tuple[str, str, int], ProcessNoise] = {
+SEARCHED: dict[tuple[str, str, int], ProcessNoise] = {
     ("mouse", "paper", 0): ProcessNoise(turn_rad=0.075, shift_mm=2.0, sigma_mm=1.0),
     ("mouse", "paper", 1): ProcessNoise(turn_rad=0.15, shift_mm=2.0, sigma_mm=1.0),
 }
-
-
-@dataclass
-class _Particles:
-    """Base joints (K) in the camera frame, their bones' scales (K,), and their weights (K,)."""
-
-    base: SE3
-    scale: Array
-    weight: Array
 
 
 class ParticleFilter:
@@ -136,7 +116,11 @@ class ParticleFilter:
         self._rng = rng
         self._noise = noise or ProcessNoise.of(estimator.skeleton.name)
         self._base_rounds = base_rounds
-        self._particles: _Particles | None = None
+        self._unit = estimator.skeleton.relative_size
+        # base joints (K) in the camera frame; None before the animal is detected
+        self._base: SE3 | None = None
+        self._scale = np.ones(0)  # (K,) of the particles' bones
+        self._weight = np.ones(0)  # (K,)
         self._last_ns = 0
 
     def step(self, frame: DepthFrame) -> tuple[Pose, float] | None:
@@ -149,103 +133,88 @@ class ParticleFilter:
             The pose () in the camera frame and its expected mean joint error, mm; None before the
             animal is detected, and if no particle can be measured.
         """
-        method = self._estimator.model.method
+        model = self._estimator.model
+        camera_view = model.method.camera_view
         depths = frame.depth[None]
-        if self._particles is None:
-            found = self._estimator.estimate(depths, self._scene, self._size)
-            self._last_ns = frame.time_ns
-            return self._begin(found) if found.found[0] else None
-        self._select()
-        self._propagate((frame.time_ns - self._last_ns) * 1e-9)
+        dt = (frame.time_ns - self._last_ns) * 1e-9
         self._last_ns = frame.time_ns
-        crops = self._scene.extract(depths, self._size, camera_view=method.camera_view)
+        if self._base is None:
+            found = self._estimator.estimate(depths, self._scene, self._size)
+            return self._begin(found) if found.found[0] else None
+        self._base = self._propagated(self._base, dt)
+        crops = self._scene.extract(depths, self._size, camera_view=camera_view)
         if not crops.found[0]:
             return None
-        crop_cameras = self._scene.crop_cameras(crops, method.camera_view)
+        crop_cameras = self._scene.crop_cameras(crops, camera_view)
         view = view_of(crop_cameras)
         T_view_camera = SE3(view.rotation[0], view.translation[0])
+        T_camera_view = T_view_camera.inverse()
         images = ImageSet(crops.heights, crop_cameras, crops.moments)
-        rotations, positions, score = self._measure(images, T_view_camera @ self._particles.base)
+        rotations, positions, score = self._measure(images, T_view_camera @ self._base)
         sigma = self._noise.sigma_mm * self._unit
         w = np.exp(-(score**2 - (score**2).min()) / (2.0 * sigma**2))
-        self._particles.weight = w / w.sum()
-        pose = self._average(rotations, positions).moved(T_view_camera.inverse())
-        self._particles.base = T_view_camera.inverse() @ SE3(rotations[:, 0], positions[:, 0])
-        calibration = self._estimator.model.calibration
-        mean = float(self._particles.weight @ score)
+        self._weight = w / w.sum()
+        pose = self._average(rotations, positions).moved(T_camera_view)
+        self._base = T_camera_view @ SE3(rotations[:, 0], positions[:, 0])
+        calibration = model.calibration
+        mean = float(self._weight @ score)
         return pose, (calibration.offset + calibration.slope * mean) * self._size
-
-    @property
-    def _unit(self) -> float:
-        return self._estimator.skeleton.relative_size
 
     def _begin(self, found: Estimates) -> tuple[Pose, float]:
         k = self._noise.n_particles
         pose = found.chosen.pose
-        base = SE3(
-            np.repeat(pose.root.rotation, k, axis=0), np.repeat(pose.root.translation, k, axis=0)
+        root = pose.root
+        self._base = SE3(
+            *(np.repeat(part, k, axis=0) for part in (root.rotation, root.translation))
         )
-        self._particles = _Particles(base, np.repeat(pose.scale, k), np.full(k, 1.0 / k))
-        return Pose(
-            SE3(pose.root.rotation[0], pose.root.translation[0]), pose.angles[0], pose.scale[0]
-        ), float(found.chosen.error_mm[0])
+        self._scale = np.repeat(pose.scale, k)
+        self._weight = np.full(k, 1.0 / k)
+        return pose[0], float(found.chosen.error_mm[0])
 
-    def _select(self) -> None:
-        """Selection: draw particles from the cumulative weights; all then have equal weights."""
-        assert self._particles is not None
-        p = self._particles
-        k = self._noise.n_particles
-        total = np.cumsum(p.weight)
-        drawn = np.searchsorted(total, self._rng.random(k) * total[-1])
-        self._particles = _Particles(
-            SE3(p.base.rotation[drawn], p.base.translation[drawn]),
-            p.scale[drawn],
-            np.full(k, 1.0 / k),
-        )
-
-    def _propagate(self, dt: float) -> None:
-        """Propagation: move every base joint along a Brownian path of dt seconds (Eq. 7)."""
-        assert self._particles is not None
+    def _propagated(self, base: SE3, dt: float) -> SE3:
+        """Selection and propagation: draw particles from the cumulative weights, and move every
+        base joint along a Brownian path of dt seconds (Eq. 7).
+        """
         noise = self._noise
-        p = self._particles
+        k = noise.n_particles
+        total = np.cumsum(self._weight)
+        drawn = np.searchsorted(total, self._rng.random(k) * total[-1])
+        self._scale = self._scale[drawn]
+        self._weight = np.full(k, 1.0 / k)
         spread = np.array([noise.turn_rad] * 3 + [noise.shift_mm * self._size * self._unit] * 3)
         n_steps = max(1, int(np.ceil(dt / noise.delta_s - 1e-9)))
         # deviations are those of a whole step: the unit of time is delta_s
-        steps = brownian_steps(self._rng, np.diag(spread**2), n_steps, len(p.scale))
-        p.base = brownian_ends(p.base, steps, 1.0, min(dt / noise.delta_s, float(n_steps)))
+        steps = brownian_steps(self._rng, np.diag(spread**2), n_steps, k)
+        base = SE3(base.rotation[drawn], base.translation[drawn])
+        return brownian_ends(base, steps, 1.0, min(dt / noise.delta_s, float(n_steps)))
 
     def _measure(self, images: ImageSet, base: SE3) -> tuple[Array, Array, Array]:
         """All joints of the particles, regressed from their bases, and the metric's scores (K,).
 
         Rotations (K, J, 3, 3) and positions (K, J, 3) mm are in the view frame.
         """
-        assert self._particles is not None
-        cascade = self._estimator.model.cascade
         model = self._estimator.model
-        k = len(self._particles.scale)
+        cascade = model.cascade
+        k = len(self._scale)
         candidates = Candidates.start(
             cascade.skeleton,
             np.zeros(k, np.int32),
             base.rotation,
             base.translation,
-            self._particles.scale,
+            self._scale,
             np.full(k, self._size),
         )
-        for joint, rounds in zip(cascade.skeleton.solved, cascade.forests, strict=True):
-            if joint:
-                cascade.place(candidates, joint)
-            for forest in rounds if joint else rounds[len(rounds) - self._base_rounds :]:
-                samples = cascade.samples(images, candidates, [joint])
-                cascade.apply(candidates, joint, cascade.predict(forest, samples))
-        cascade.place_ends(candidates)
-        self._particles.scale = candidates.scale  # a base round may have corrected it
+        first_round = len(cascade.forests[0]) - self._base_rounds
+        some = replace(cascade, forests=[cascade.forests[0][first_round:], *cascade.forests[1:]])
+        for _ in some.steps(images, candidates):
+            pass
+        self._scale = candidates.scale  # a base round may have corrected it
         scores = cascade.predict(model.metric, cascade.metric_samples(images, candidates))
         return candidates.rotations, candidates.positions, scores[:, 0].astype(float)
 
     def _average(self, rotations: Array, positions: Array) -> Pose:
         """Eq. 14 at the average itself: the base on SE(3), other joints on their axes."""
-        assert self._particles is not None
-        weight = self._particles.weight
+        weight = self._weight
         skeleton = self._estimator.skeleton
         base = SE3(rotations[:, 0], positions[:, 0])
         best = int(np.argmax(weight))
@@ -259,4 +228,4 @@ class ParticleFilter:
         for joint in skeleton.solved[1:]:
             home = rotations[:, skeleton.parents[joint]] @ skeleton.rest[joint]
             angles[joint] = weight @ so3.log(np.swapaxes(home, 1, 2) @ rotations[:, joint])
-        return Pose(root, angles, np.asarray(weight @ self._particles.scale))
+        return Pose(root, angles, np.asarray(weight @ self._scale))

@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
-from liex_lab.runtime.shapes import check_shapes
 from liex_lab.scene.height_maps import CROP, HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
-from liex_lab.tracking.trust import MOST_ERROR, MOST_RESIDUAL
+from liex_lab.tracking.trust import MOST_ERROR, MOST_RESIDUAL, finite_median
 
 Array = NDArray[np.float64]
 
@@ -39,7 +38,7 @@ _MIN_PART = 0.05
 
 
 @dataclass(frozen=True)
-class Agreement:
+class BodyAgreement:
     """The agreement of rendered bodies with the depth in n height maps.
 
     Attributes:
@@ -88,7 +87,7 @@ class BodyResidual:
         """
         return self.agreement(pose_arena, crops, scene).residual_mm
 
-    def agreement(self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter) -> Agreement:
+    def agreement(self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter) -> BodyAgreement:
         """Distance of the body from the depth, and overlap of their outlines.
 
         Args:
@@ -99,13 +98,13 @@ class BodyResidual:
         Returns:
             The agreement of each pose with its height map.
         """
-        n = len(pose_arena.scale)
-        check_shapes("poses", ("heights", crops.heights, (n, CROP, CROP)))
-        if n == 0:
-            return Agreement(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
-        across = self.girth * self._usual_across(pose_arena.scale)
-        rendered = render_crops(self.surface, pose_arena, across, crops, scene)
-        out = np.empty((4, n))
+        out = np.empty((4, len(pose_arena.scale)))
+        if not out.size:
+            return BodyAgreement(*out)
+        across = pose_arena.scale
+        if self.size is not None and self.surface.shape is not None:
+            across = self.size * np.sqrt(self.size / across)
+        rendered = render_crops(self.surface, pose_arena, self.girth * across, crops, scene)
         planes = scene.planes(crops, self.camera_view)
         joints = scene.camera.project(
             scene.floor.T_arena_camera.inverse() @ joints_of(self.surface.skeleton, pose_arena)
@@ -113,13 +112,7 @@ class BodyResidual:
         _compare(
             rendered, crops.heights, crops.origin, crops.step, planes, crops.distance, joints, out
         )
-        return Agreement(*out)
-
-    def _usual_across(self, scale: Array) -> Array:
-        """Factors (n,) of all lengths across a body of girth 1 whose bones have a scale (n,)."""
-        if self.size is None or self.surface.shape is None:
-            return scale
-        return np.asarray(self.size * np.sqrt(self.size / scale))
+        return BodyAgreement(*out)
 
     @staticmethod
     def fit(
@@ -149,17 +142,11 @@ class BodyResidual:
         least = np.inf
         for girth in _GIRTHS:
             body = BodyResidual(surface, float(girth), camera_view, size)
-            cost = _median(body.of(placed, crops, scene))
+            cost = finite_median(body.of(placed, crops, scene), np.inf)
             if cost < least:
                 best = body
                 least = cost
         return best
-
-
-def _median(residual_mm: Array) -> float:
-    """The median of the known values; infinite if there are none."""
-    known = residual_mm[np.isfinite(residual_mm)]
-    return float(np.median(known)) if len(known) else np.inf
 
 
 def render_crops(
@@ -332,38 +319,8 @@ class SampleFit:
     beside: float
     n_animals: int = 1
 
-    @staticmethod
-    def of(
-        n_frames: int, spine_mm: float, error_mm: Array, agreement: Agreement, n_animals: int = 1
-    ) -> SampleFit:
-        """The fit of a sample of frames.
-
-        Args:
-            n_frames: frames of the sample that hold depth.
-            spine_mm: the animal's length, mm.
-            error_mm: (m,) predicted errors of the m frames with a pose, mm, at least one.
-            agreement: of those m poses with their depth images.
-            n_animals: objects of the animal's size in view at once.
-        """
-        residual = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
-        return SampleFit(
-            n_frames,
-            len(error_mm),
-            spine_mm,
-            float(np.median(error_mm)),
-            float(np.median(residual)) if len(residual) else float("nan"),
-            float(np.median(agreement.covered)),
-            float(np.median(agreement.beside)),
-            n_animals,
-        )
-
     def has_length(self, low_mm: float, high_mm: float) -> bool:
-        """Whether the length is one that a plan allows.
-
-        Args:
-            low_mm: the plan's least length of the animal, mm.
-            high_mm: its largest, mm.
-        """
+        """Whether a plan with these limits of the length, mm, allows the animal's length."""
         return low_mm * (1.0 - _SIZE_MARGIN) <= self.spine_mm <= high_mm * (1.0 + _SIZE_MARGIN)
 
     def misfits(self, low_mm: float, high_mm: float, stated: bool = False) -> list[str]:
@@ -405,7 +362,9 @@ class SampleFit:
         return found
 
 
-def count_animals(first: Agreement, second: Agreement, rows: NDArray[np.int64], n: int) -> int:
+def count_animals(
+    first: BodyAgreement, second: BodyAgreement, rows: NDArray[np.int64], n: int
+) -> int:
     """How many objects of the animal's size are in view at once: 1 or 2.
 
     Args:
@@ -416,9 +375,8 @@ def count_animals(first: Agreement, second: Agreement, rows: NDArray[np.int64], 
     """
     if not len(rows) or not n:
         return 1
-    usual = np.nanmedian(first.residual_mm) if np.isfinite(first.residual_mm).any() else 0.0
     alike = (
-        (second.residual_mm <= 1.5 * usual)
+        (second.residual_mm <= 1.5 * finite_median(first.residual_mm, 0.0))
         & (second.covered >= 0.8 * np.median(first.covered))
         & (second.beside <= _MOST_BESIDE)  # a shorter animal fills less of a body of this length
     )

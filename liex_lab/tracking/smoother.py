@@ -8,11 +8,32 @@ a gate beyond which a measurement is excluded. A share c^2 of the error variance
 neighbouring frames: smoothing cannot reduce it, so it is excluded from the filter and added to the
 posterior. Calibration factors then scale the posterior spread to the errors observed on rendered
 sequences. The kernels are in `_smoother_kernels`.
+
+The smoother also moves the frames around corrected poses (`let_follow`), which are measurements to
+it: conditioning of a Gaussian process (Rauch, Tung and Striebel 1965). It is affine in its
+measurements, and an additional measurement that agrees with the curve changes nothing. So a pose
+placed off the curve by δ at frame k moves the curve by the smoother's response to the measurements
+
+  y_k = δ  with (almost) no error,    y_t = 0  with the error of frame t elsewhere,
+
+coordinate by coordinate: the joints' mean (mm), the base's rotation log(R^T R') and the joints'
+angles (rad). Frames that differ from the correction by more than their predicted errors weigh less,
+with the same weights in four passes, and the curve stays smooth. A frame follows only until one of
+its joints reaches the floor.
+
+Motion and association parameters of each animal are stored in `tunings.toml` next to this module:
+how it moves (integrated Ornstein-Uhlenbeck processes), how single frames err, and the costs of a
+chain of hypotheses. `liex train tracking` fits them on rendered sequences whose seeds are not those
+of any test.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import tomllib
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +41,53 @@ from numpy.typing import NDArray
 from liex_lab.body.kinematics import KinematicTree
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.geometry import SE3
-from liex_lab.runtime.shapes import check_shapes
+from liex_lab.geometry import SE3, so3
 from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking.observations import joints_of
+from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
-_PASSES = 4
+
+TUNINGS = Path(__file__).with_name("tunings.toml")
+# fields of `MotionParameters` with another name in the file, kept for compatibility
+_STORED_AS = {
+    "position_error": "place_error",
+    "position_variance": "place_drive",
+    "position_decay_s": "place_fade",
+    "degrees_of_freedom": "freedom",
+    "gate": "reject",
+    "correlated_share": "lasting",
+    "calibration": "honest",
+    "root_calibration": "honest_root",
+    "bend_calibration": "honest_bend",
+    "joint_calibration": "honest_joints",
+}
+_USUAL = "mouse"  # used for animals without parameters of their own
+
+
+@dataclass(frozen=True)
+class AssociationCosts:
+    """Costs of a chain of hypotheses, nats; lengths are those of an animal of the reference length.
+
+    Attributes:
+        score_mm: the score of the learned metric, mm, that costs one nat.
+        score_most: the largest cost of a score, nats.
+        none: missed-detection cost, for skipping a frame.
+        ceiling: the largest cost of a transition.
+        error_factor: standard deviation of a measurement over its predicted error.
+        shift: random speed of the middle, lengths a second (standard deviation).
+        bend: random change of the posture about the middle, lengths a second.
+        tail: above this many nats, a transition cost grows logarithmically.
+    """
+
+    score_mm: float
+    score_most: float
+    none: float
+    ceiling: float
+    error_factor: float
+    shift: float
+    bend: float
+    tail: float
 
 
 @dataclass(frozen=True)
@@ -47,7 +108,7 @@ class OrnsteinUhlenbeck:
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionParameters:
     """Motion and error parameters of an animal; errors are over the predicted mean joint error.
 
     Attributes:
@@ -110,19 +171,18 @@ class Motion:
     @property
     def packed(self) -> kernels.Moves:
         """The parameters as arrays for the numba kernels; position variance as (3,) x, y, z."""
-
-        def rows(*moves: OrnsteinUhlenbeck) -> Array:
-            """One row (error, process variance, decay time) per coordinate, (k, 3)."""
-            return np.array([[m.error, m.process_variance, m.decay_s] for m in moves])
-
+        turn, bend, size = (
+            np.array([[m.error, m.process_variance, m.decay_s] for m in moves])
+            for moves in (self.turn, self.bend, (self.size,))
+        )
         level, up = self.position_variance
         return kernels.Moves(
             np.array(self.position_error),
             np.array([level, level, up]),
             self.position_decay_s,
-            rows(*self.turn),
-            rows(*self.bend),
-            rows(self.size)[0],
+            turn,
+            bend,
+            size[0],
             self.degrees_of_freedom,
             self.gate,
             self.correlated_share,
@@ -130,7 +190,118 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Curve:
+class TrackingParameters:
+    """The parameters of one animal.
+
+    Attributes:
+        chain: costs of the association by Viterbi.
+        motion: motion and error parameters of the smoother.
+    """
+
+    chain: AssociationCosts
+    motion: MotionParameters
+
+    @staticmethod
+    @cache
+    def of(name: str) -> TrackingParameters:
+        """The parameters of an animal, or the mouse's if it has none of its own.
+
+        Args:
+            name: name of the skeleton, such as 'fish'.
+
+        Returns:
+            The parameters, cached by name.
+        """
+        known = tomllib.loads(TUNINGS.read_text(encoding="utf-8"))
+        if name in known:
+            return TrackingParameters.from_table(known[name])
+        usual = TrackingParameters.from_table(known[_USUAL])
+        # the joints differ
+        return replace(usual, motion=replace(usual.motion, joint_calibration=()))
+
+    @staticmethod
+    def from_table(table: dict[str, Any]) -> TrackingParameters:
+        """The parameters from their TOML table.
+
+        Args:
+            table: the tables `chain` and `motion` as read by `tomllib`; the three numbers of a
+                coordinate are error, drive (process variance) and fade (decay time).
+        """
+        field_of = {stored: name for name, stored in _STORED_AS.items()}
+        motion = {field_of.get(key, key): value for key, value in table["motion"].items()}
+        for group in ("turn", "bend"):
+            motion[group] = tuple(OrnsteinUhlenbeck(*row) for row in motion[group])
+        motion["size"] = OrnsteinUhlenbeck(*motion["size"])
+        for name in (
+            "position_error",
+            "position_variance",
+            "stretch",
+            "root_calibration",
+            "bend_calibration",
+        ):
+            motion[name] = tuple(motion[name])
+        motion["joint_calibration"] = tuple(motion.get("joint_calibration", ()))
+        motion["calibration"] = tuple((stated, factor) for stated, factor in motion["calibration"])
+        return TrackingParameters(AssociationCosts(**table["chain"]), MotionParameters(**motion))
+
+    def to_toml(self, name: str) -> str:
+        """The parameters as TOML tables, numbers to four significant digits.
+
+        Args:
+            name: the animal, as the tables' prefix.
+
+        Returns:
+            The text of `[name.chain]` and `[name.motion]`.
+        """
+        lines = [
+            f"[{name}.chain]",
+            *(f"{key} = {_text(value)}" for key, value in asdict(self.chain).items()),
+        ]
+        lines += ["", f"[{name}.motion]"]
+        for key, value in asdict(self.motion).items():
+            rows = [list(row.values()) for row in value] if key in ("turn", "bend") else value
+            rows = list(value.values()) if key == "size" else rows
+            lines.append(f"{_STORED_AS.get(key, key)} = {_text(rows)}")
+        return "\n".join(lines) + "\n"
+
+
+def tunings_with(name: str, tuning: TrackingParameters) -> str:
+    """The text of `tunings.toml` with an animal's tables added or replaced.
+
+    Args:
+        name: name of the animal's skeleton.
+        tuning: its parameters.
+
+    Returns:
+        The whole file, including its leading comment.
+    """
+    text = TUNINGS.read_text(encoding="utf-8")
+    head = text[: text.index("\n[")]
+    known = {
+        animal: TrackingParameters.from_table(table)
+        for animal, table in tomllib.loads(text).items()
+    } | {name: tuning}
+    return "\n".join(
+        [head.rstrip("\n") + "\n", *(each.to_toml(animal) for animal, each in known.items())]
+    )
+
+
+def _text(value: Any) -> str:
+    """A number, or lists of them, in TOML."""
+    return (
+        f"[{', '.join(map(_text, value))}]"
+        if isinstance(value, list | tuple)
+        else repr(float(f"{value:.4g}"))
+    )
+
+
+Rows = NDArray[np.int64]
+
+_PASSES = 4
+
+
+@dataclass(frozen=True)
+class SmoothedCurve:
     """A smoothed curve of n frames, arena frame, with its posterior spread.
 
     Attributes:
@@ -151,18 +322,18 @@ class Curve:
     sd_bend: Array
     used: NDArray[np.bool_]
 
-    def __getitem__(self, rows: slice) -> Curve:
+    def __getitem__(self, rows: slice) -> SmoothedCurve:
         """Some consecutive frames."""
-        return Curve(self.pose[rows], *(getattr(self, name)[rows] for name in _ROWS))
+        return SmoothedCurve(self.pose[rows], *(getattr(self, name)[rows] for name in _ROWS))
 
     @staticmethod
-    def unknown(n: int, n_joints: int) -> Curve:
+    def unknown(n: int, n_joints: int) -> SmoothedCurve:
         """A curve without measurements: all NaN, none used."""
         nan = np.full((n, n_joints, 3, 3), np.nan)
         axes = nan[:, 0, 0]
         none = nan[:, 0, 0, 0]
         pose = Pose(SE3(nan[:, 0], axes), nan[..., 0], none)
-        return Curve(pose, nan[..., 0], none, nan[:, 0], axes, axes, np.zeros(n, np.bool_))
+        return SmoothedCurve(pose, nan[..., 0], none, nan[:, 0], axes, axes, np.zeros(n, np.bool_))
 
 
 _ROWS = ("joints", "error_mm", "cov_middle_mm2", "sd_turn", "sd_bend", "used")
@@ -174,8 +345,8 @@ def smooth(
     pose: Pose,
     error_mm: Array,
     length_mm: float,
-    motion: Motion,
-) -> Curve:
+    motion: MotionParameters,
+) -> SmoothedCurve:
     """Smooth measured poses, and estimate the posterior spread.
 
     Errors have heavy tails: measurements far off the curve are down-weighted (iterated weights of a
@@ -194,101 +365,38 @@ def smooth(
         A curve of n frames; all NaN if there are no measurements.
     """
     n = len(seconds)
-    check_shapes(
-        "a track",
-        ("rotations", pose.root.rotation, (n, 3, 3)),
-        ("angles", pose.angles, (n, skeleton.n_joints, 3)),
-        ("scales", pose.scale, (n,)),
-        ("error_mm", error_mm, (n,)),
-    )
     known = np.isfinite(pose.scale) & np.isfinite(error_mm)
     if not known.any():
-        return Curve.unknown(n, skeleton.n_joints)
-    seen = kernels.Poses(
+        return SmoothedCurve.unknown(n, skeleton.n_joints)
+    measured = kernels.PoseArrays(
         pose.root.rotation,
         pose.root.translation,
         pose.angles,
         np.log(pose.scale),
         joints_of(skeleton, pose),
     )
-    made = kernels.Poses(*(np.zeros(values.shape) for values in seen))
+    made = kernels.PoseArrays(*(np.zeros(values.shape) for values in measured))
     spread = kernels.Spread(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
-    smoother = _Smoother(seconds, seen, error_mm, known, KinematicTree.of(skeleton), motion.packed)
-    used = smoother.smooth(float(length_mm), made, spread)
-    return _curve(seconds, error_mm, length_mm, motion, made, spread, used)
-
-
-@dataclass(frozen=True)
-class _Smoother:
-    """Measured poses of n frames, at least one of them measured, and their errors.
-
-    Attributes:
-        seconds: (n,) s.
-        seen: the measured poses, arena frame.
-        error: (n,) predicted mean joint error, mm.
-        known: (n,) measured.
-        body: kinematic tree of the skeleton.
-        moves: motion and error parameters.
-    """
-
-    seconds: Array
-    seen: kernels.Poses
-    error: Array
-    known: NDArray[np.bool_]
-    body: KinematicTree
-    moves: kernels.Moves
-
-    def smooth(
-        self, length: float, made: kernels.Poses, spread: kernels.Spread
-    ) -> NDArray[np.bool_]:
-        """Fill `made` with the smoothed curve, and `spread` without the correlated share.
-
-        If the gate excludes all frames, every measured one is used again.
-
-        Args:
-            length: spine length of the animal, mm.
-            made: output.
-            spread: output.
-
-        Returns:
-            (n,) the frames used.
-        """
-        n = len(self.error)
-        middle, frame, weight = np.empty((n, 3)), np.empty((n, 3, 3)), np.ones(n)
-        used = self.known.copy()
-        kernels.middles(self.seen.joints, self.known, self.body.tip, middle, frame)
-        for again in range(_PASSES):
-            if again and not kernels.weigh(
-                self.seen.joints,
-                made.joints,
-                self.error,
-                self.known,
-                self.moves.degrees_of_freedom,
-                self.moves.gate,
-                weight,
-                used,
-            ):
-                used[:] = self.known
-            self._pass(middle, frame, weight, length, made, spread, used)
-        return used
-
-    def _pass(
-        self,
-        middle: Array,
-        frame: Array,
-        weight: Array,
-        length: float,
-        made: kernels.Poses,
-        spread: kernels.Spread,
-        used: NDArray[np.bool_],
-    ) -> None:
-        """One filter and smoother pass, each measurement's variance divided by its weight."""
-        moves, seen, n = self.moves, self.seen, len(used)
-        start = int(used.argmax())
+    body, moves = KinematicTree.of(skeleton), motion.packed
+    middle, frame, weight = np.empty((n, 3)), np.empty((n, 3, 3)), np.ones(n)
+    used = known.copy()
+    kernels.middles(measured.joints, known, body.tip, middle, frame)
+    for again in range(_PASSES):
+        if again and not kernels.weigh(
+            measured.joints,
+            made.joints,
+            error_mm,
+            known,
+            moves.degrees_of_freedom,
+            moves.gate,
+            weight,
+            used,
+        ):
+            used[:] = known  # the gate excluded all frames
         variance, r = np.full(n, np.inf), np.zeros((n, 3, 3))
         kernels.measured_spread(
             frame,
-            self.error,
+            error_mm,
             weight,
             used,
             moves.position_error,
@@ -296,73 +404,221 @@ class _Smoother:
             variance,
             r,
         )
-        out = np.empty((n, 3))
-        kernels.smooth_positions(
-            self.seconds,
+        _smooth_once(
+            seconds,
+            measured,
+            used,
             middle,
             r,
-            used,
-            start,
-            moves.position_variance * (length * length),
-            moves.position_decay_s,
-            out,
-            spread.middle,
+            variance,
+            float(length_mm),
+            body,
+            moves,
+            made,
+            spread,
         )
-        gain, covariances = kernels.Gains.blank(n), kernels.Covariances.blank(n)
-        later = np.maximum(np.arange(n), start)
+    return _curve(seconds, error_mm, length_mm, motion, made, spread, used)
 
-        def fill(a: int, group: Array, left: Array | None = None) -> kernels.Gains:
-            """The gains of an axis with these parameters; its posterior variance goes to `left`."""
-            relative, axis = group[0] / length, gain.axis(a)
-            measured = relative * relative * variance
-            kernels.gains(self.seconds, measured, group[1], group[2], start, axis, covariances)
-            if left is not None:
-                left[:] = covariances.smoothed[later, 0, 0]
-            return axis
 
-        for a in range(3):
-            fill(a, moves.turn[a], spread.turn[:, a])
-        kernels.smooth_rotations(seen.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
-        bend = [fill(a, moves.bend[a], spread.bend[:, a]) for a in range(3)]
-        value, rate = np.zeros(n), np.zeros(n)
-        for j, a in self.body.free:
-            kernels.smooth_values(seen.angles[:, j, a].copy(), used, start, bend[a], value, rate)
-            made.angles[:, j, a] = value
-        size = fill(0, moves.size)
-        kernels.smooth_values(seen.log_scale, used, start, size, made.log_scale, rate)
-        kernels.place_middles(self.body, out, made)
+def _smooth_once(
+    seconds: Array,
+    measured: kernels.PoseArrays,
+    used: NDArray[np.bool_],
+    middle: Array,
+    r: Array,
+    variance: Array,
+    length: float,
+    body: KinematicTree,
+    moves: kernels.Moves,
+    made: kernels.PoseArrays,
+    spread: kernels.Spread,
+) -> None:
+    """One filter and smoother pass: fills `made`, and `spread` without the correlated share.
+
+    The measurements that are used have variances (n,), and their middles (n, 3) covariances r (n,
+    3, 3).
+    """
+    n = len(used)
+    start = int(used.argmax())
+    out = np.empty((n, 3))
+    kernels.smooth_positions(
+        seconds,
+        middle,
+        r,
+        used,
+        start,
+        moves.position_variance * (length * length),
+        moves.position_decay_s,
+        out,
+        spread.middle,
+    )
+    gain, covariances = kernels.Gains.blank(n), kernels.Covariances.blank(n)
+    later = np.maximum(np.arange(n), start)
+
+    def fill(a: int, group: Array, left: Array | None = None) -> kernels.Gains:
+        """The gains of an axis with these parameters; its posterior variance goes to `left`."""
+        relative, axis = group[0] / length, gain.axis(a)
+        measured_variance = relative * relative * variance
+        kernels.gains(seconds, measured_variance, group[1], group[2], start, axis, covariances)
+        if left is not None:
+            left[:] = covariances.smoothed[later, 0, 0]
+        return axis
+
+    for a in range(3):
+        fill(a, moves.turn[a], spread.turn[:, a])
+    kernels.smooth_rotations(measured.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
+    bend = [fill(a, moves.bend[a], spread.bend[:, a]) for a in range(3)]
+    value, rate = np.zeros(n), np.zeros(n)
+    for j, a in body.free:
+        kernels.smooth_values(measured.angles[:, j, a].copy(), used, start, bend[a], value, rate)
+        made.angles[:, j, a] = value
+    size = fill(0, moves.size)
+    kernels.smooth_values(measured.log_scale, used, start, size, made.log_scale, rate)
+    kernels.place_middles(body, out, made)
 
 
 def _curve(
     seconds: Array,
     error_mm: Array,
     length_mm: float,
-    motion: Motion,
-    made: kernels.Poses,
+    motion: MotionParameters,
+    made: kernels.PoseArrays,
     spread: kernels.Spread,
     used: NDArray[np.bool_],
-) -> Curve:
-    """The kernels' output as a `Curve`: posterior and correlated share, calibrated."""
-    correlated_share = motion.correlated_share * np.interp(seconds, seconds[used], error_mm[used])
+) -> SmoothedCurve:
+    """The kernels' output as a `SmoothedCurve`: posterior and correlated share, calibrated."""
+    correlated_mm = motion.correlated_share * np.interp(seconds, seconds[used], error_mm[used])
     middle = np.trace(spread.middle, axis1=1, axis2=2)
     place = np.array(motion.position_error)
     moves = motion.packed
     # parts of the predicted error due to the joints' mean and to the bends
     relative = 0.5 * middle / (place**2).sum()
     relative += 0.5 * (spread.bend / moves.bend[:, 0] ** 2).mean(axis=1) * length_mm**2
-    cov_middle = (
-        spread.middle + (place**2).mean() * np.eye(3) * correlated_share[:, None, None] ** 2
-    )
+    cov_middle = spread.middle + (place**2).mean() * np.eye(3) * correlated_mm[:, None, None] ** 2
     turn, bend = (
-        np.sqrt(left + (group[:, 0] * correlated_share[:, None] / length_mm) ** 2)
+        np.sqrt(left + (group[:, 0] * correlated_mm[:, None] / length_mm) ** 2)
         for left, group in ((spread.turn, moves.turn), (spread.bend, moves.bend))
     )
     pose = Pose(SE3(made.rotation, made.place), made.angles, np.exp(made.log_scale))
-    error = np.sqrt(correlated_share**2 + relative)
-    calibration = np.interp(
-        np.log(error / length_mm),
-        *np.array([(np.log(said), factor) for said, factor in motion.calibration]).T,
-    )
+    error = np.sqrt(correlated_mm**2 + relative)
+    stated, factor = np.array(motion.calibration).T
+    calibration = np.interp(np.log(error / length_mm), np.log(stated), factor)
     each = calibration[:, None]
     cov_middle *= each[:, None] ** 2
-    return Curve(pose, made.joints, calibration * error, cov_middle, each * turn, each * bend, used)
+    return SmoothedCurve(
+        pose, made.joints, calibration * error, cov_middle, each * turn, each * bend, used
+    )
+
+
+# Frames around corrected poses follow them.
+
+
+_REACH = 160  # frames on either side that may move
+_CERTAIN = 1e-3  # error of a correction over a frame's predicted error
+_HALVINGS = 10  # bisection steps of the share by which a frame can move above the floor
+_LEAST_MM = 0.02  # poses that would move less are unchanged
+_LEAST_ERROR = 0.005  # smallest error of a frame, over the length
+
+
+def let_follow(track: Track, was: Pose, placed: Rows) -> Rows:
+    """Move the poses around corrected ones with them, in place; returns the moved rows.
+
+    Args:
+        track: the track, n rows, with the corrected poses already set; changed in place, except for
+            `uv_px`, which belongs to the camera.
+        was: the n poses before the correction.
+        placed: (k,) rows of the corrected poses, ascending.
+
+    Returns:
+        (m,) moved rows, ascending, without the corrected ones.
+    """
+    near = np.zeros(len(track.times_ns), bool)
+    for row in placed:
+        near[max(0, row - _REACH) : row + _REACH + 1] = True
+    rows = np.flatnonzero(near & np.isfinite(track.joints_mm).all(axis=(1, 2)))
+    followed = []
+    for run in np.split(rows, np.flatnonzero(np.diff(rows) > _REACH) + 1):
+        if len(run):
+            followed.append(_follow(track, was, run, np.isin(run, placed)))
+    return np.concatenate(followed) if followed else np.zeros(0, np.int64)
+
+
+def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> Rows:
+    """Move one stretch of rows; the mask marks the corrected ones."""
+    skeleton = track.skeleton
+    motion = TrackingParameters.of(skeleton.name).motion
+    joints_were = was[rows].joints(skeleton)
+    length = float(np.nanmedian(track.scale[rows])) * skeleton.length
+    # differences between current and previous poses (n, 6 + 3 J): mean, rotation, angles
+    middle = (track.joints_mm[rows] - joints_were).mean(axis=1)
+    turn = so3.log(np.swapaxes(was.root.rotation[rows], 1, 2) @ track.root_rotation[rows])
+    bend = track.angles_rad[rows] - was.angles[rows]
+    off = np.hstack([middle, turn, bend.reshape(len(rows), -1)])
+    off[~placed] = 0.0
+    error = np.nan_to_num(track.predicted_error_mm[rows], nan=np.inf)
+    error = np.maximum(error, _LEAST_ERROR * length)
+    error[track.bridged[rows] & ~placed] = np.inf
+    error[placed] = _CERTAIN * _LEAST_ERROR * length
+    seconds = (track.times_ns[rows] - track.times_ns[rows[0]]) * 1e-9
+    weight = np.ones(len(rows))
+    nu = motion.degrees_of_freedom
+    for _ in range(_PASSES):
+        moved = _smoothed(seconds, off, error / np.sqrt(weight), length, motion)
+        pose = _moved(track, was, rows, moved)
+        apart = np.linalg.norm(pose.joints(skeleton) - joints_were, axis=-1).mean(axis=1)
+        weight = np.where(placed, 1.0, (nu + 1.0) / (nu + (apart / error) ** 2))
+    lowest = np.minimum(joints_were[..., 2], 0.0)
+    share = high = np.ones((len(rows), 1))
+    low = np.zeros((len(rows), 1))  # the share of the move that keeps a frame above the floor
+    for _ in range(_HALVINGS):
+        joints = _moved(track, was, rows, share * moved).joints(skeleton)
+        above = (joints[..., 2] >= lowest).all(axis=1, keepdims=True)
+        low, high = np.where(above, share, low), np.where(above, high, share)
+        share = 0.5 * (low + high)
+    pose = _moved(track, was, rows, low * moved)
+    far = np.linalg.norm(pose.joints(skeleton) - joints_were, axis=-1).max(axis=1) > _LEAST_MM
+    chosen = np.flatnonzero(far & ~placed)
+    track.put_pose(rows[chosen], pose[chosen])
+    return rows[chosen]
+
+
+def _smoothed(
+    seconds: Array, off: Array, error: Array, length: float, motion: MotionParameters
+) -> Array:
+    """The smoother's response to the differences (n, c), coordinate by coordinate."""
+    n, n_coordinates = off.shape
+    known = np.isfinite(error)
+    start = int(np.argmax(known))
+    variance = (1.0 - motion.correlated_share**2) * error**2
+    level, up = motion.position_variance
+    place = float(np.mean(np.square(motion.position_error)))
+    groups = [
+        *((place, drive * length**2, motion.position_decay_s) for drive in (level, level, up)),
+        *(
+            ((move.error / length) ** 2, move.process_variance, move.decay_s)
+            for move in (*motion.turn, *motion.bend)
+        ),
+    ]
+    made = np.zeros(off.shape, order="F")
+    for group, (share, drive, decay_s) in enumerate(groups):
+        gain = kernels.Gains.blank(n).axis(0)
+        covariances = kernels.Covariances.blank(n)
+        kernels.gains(seconds, share * variance, drive, decay_s, start, gain, covariances)
+        for column in [group] if group < 6 else range(group, n_coordinates, 3):
+            measured = np.ascontiguousarray(off[:, column])
+            kernels.smooth_values(measured, known, start, gain, made[:, column], np.zeros(n))
+    return made
+
+
+def _moved(track: Track, was: Pose, rows: Rows, moved: Array) -> Pose:
+    """The poses as they were, moved by middle, turn and angles (n, 6 + 3 J)."""
+    skeleton = track.skeleton
+    before = was[rows]
+    angles = before.angles + moved[:, 6:].reshape(before.angles.shape)
+    inside = np.clip(angles, skeleton.limits[..., 0], skeleton.limits[..., 1])
+    angles = np.where(angles == before.angles, angles, inside)
+    rotation = before.root.rotation @ so3.exp(moved[:, 3:6])
+    pose = Pose(SE3(rotation, before.root.translation), angles, before.scale)
+    middle = before.joints(skeleton).mean(axis=1) + moved[:, :3]
+    shift = middle - pose.joints(skeleton).mean(axis=1)
+    return replace(pose, root=SE3(rotation, before.root.translation + shift))

@@ -353,8 +353,7 @@ def short_gaps(
     rows = np.flatnonzero(measured)
     if not len(rows):
         return np.zeros(len(measured), np.bool_)
-    t = np.arange(len(measured))
-    after = np.searchsorted(rows, t)
+    after = np.searchsorted(rows, np.arange(len(measured)))
     inside = (after > 0) & (after < len(rows))
     before = rows[np.maximum(after - 1, 0)]
     after = rows[np.minimum(after, len(rows) - 1)]

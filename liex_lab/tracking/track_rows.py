@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from liex_lab.geometry import so3
 from liex_lab.tracking.association import NONE
-from liex_lab.tracking.motion_model import TrackingParameters
 from liex_lab.tracking.observations import Observations, joints_of
-from liex_lab.tracking.smoother import Curve
+from liex_lab.tracking.smoother import SmoothedCurve, TrackingParameters
 from liex_lab.tracking.track import Subject, Track, short_gaps
 from liex_lab.tracking.trust import (
     MOST_ERROR,
@@ -36,14 +35,18 @@ MEAN_PER_SD = 0.8  # the mean of |x| over the standard deviation of a Gaussian x
 ERROR_PER_SD = 1.4
 
 
+# columns that describe the observed animal, not its pose
+SIGHT = ("n_foreground_px", "centroid_mm", "centroid_px", "residual_mm")
+
+
 def to_track(
     subject: Subject,
-    seen: Observations,
+    observed: Observations,
     path: NDArray[np.int64],
-    curve: Curve,
+    curve: SmoothedCurve,
     doubt: Array,
     ahead: bool = False,
-    told: slice = slice(None),
+    due: slice = slice(None),
     tuning: TrackingParameters | None = None,
     usual_px: float | None = None,
 ) -> Track:
@@ -51,40 +54,31 @@ def to_track(
 
     Args:
         subject: the animal of the track.
-        seen: hypotheses (n, H) of the frames that the curve covers.
+        observed: hypotheses (n, H) of the frames that the curve covers.
         path: (n,) hypothesis of each frame, `NONE` if it was skipped.
         curve: smoothed poses of the n frames, arena frame.
         doubt: (n,) probability that head and tail are exchanged.
         ahead: extend the curve for up to `bridge_s` after the last measurement (prediction).
-        told: rows to return; gaps are determined from all n.
+        due: rows to return; gaps are determined from all n.
         tuning: motion parameters with the calibration factors; None uses the animal's own.
         usual_px: the animal's usual number of pixels; None uses the median of these frames.
 
     Returns:
-        A track of the rows `told`; NaN if nothing was measured or bridged, flagged as hidden if too
+        A track of the rows `due`; NaN if nothing was measured or bridged, flagged as hidden if too
         little of the animal is visible next to a nearer object.
     """
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
-    bridged = short_gaps(seen.seconds, measured, subject.bridge_s, ahead)
-    track = Track.empty(subject.skeleton, seen.times_ns[told])
-    write_curve(subject, track, curve[told], tuning)
-    usual_px = usual_pixels(seen, path) if usual_px is None else usual_px
-    in_view = share_in_view(seen, path, usual_px)
-    strayed = doubted(subject, seen, path, in_view, usual_px)
+    bridged = short_gaps(observed.seconds, measured, subject.bridge_s, ahead)
+    track = Track.empty(subject.skeleton, observed.times_ns[due])
+    write_curve(subject, track, curve[due], tuning)
+    usual_px = usual_pixels(observed, path) if usual_px is None else usual_px
+    in_view = share_in_view(observed, path, usual_px)
     unknown = lies_unknown(in_view, doubt)
-    measured &= ~unknown
-    mask_and_flag(
-        subject,
-        track,
-        seen[told],
-        path[told],
-        doubt[told],
-        measured[told],
-        bridged[told],
-        strayed[told],
-    )
-    hide(track, unknown[told] & ~bridged[told])
+    masks = measured & ~unknown, bridged, doubted(subject, observed, path, in_view, usual_px)
+    some = (mask[due] for mask in masks)
+    mask_and_flag(subject, track, observed[due], path[due], doubt[due], *some)
+    hide(track, (unknown & ~bridged)[due])
     return track
 
 
@@ -121,7 +115,9 @@ def _mask(track: Track, rows: NDArray[np.bool_]) -> None:
         column[rows] = np.nan
 
 
-def write_curve(subject: Subject, track: Track, curve: Curve, tuning: TrackingParameters) -> None:
+def write_curve(
+    subject: Subject, track: Track, curve: SmoothedCurve, tuning: TrackingParameters
+) -> None:
     """Write a curve into rows of a track, measured or not.
 
     Args:
@@ -159,16 +155,15 @@ def write_curve(subject: Subject, track: Track, curve: Curve, tuning: TrackingPa
     track.cov_root[:] = covariance_of_root(curve) * (calibration[:, None] * calibration)
     for constant_mm in (up, along):
         track.cov_root[:, 3:, 3:] += constant_mm[:, :, None] * constant_mm[:, None, :]
-    track.sd_angles_rad[:] = (curve.sd_bend * motion.bend_calibration)[
-        :, None
-    ] * subject.skeleton.axes
+    sd_bend = curve.sd_bend * motion.bend_calibration
+    track.sd_angles_rad[:] = sd_bend[:, None] * subject.skeleton.axes
     track.sd_angles_rad[:, 0] = 0.0
 
 
 def mask_and_flag(
     subject: Subject,
     track: Track,
-    seen: Observations,
+    observed: Observations,
     path: NDArray[np.int64],
     doubt: Array,
     measured: NDArray[np.bool_],
@@ -180,7 +175,7 @@ def mask_and_flag(
     Args:
         subject: the animal of the track.
         track: its n rows, changed in place.
-        seen: hypotheses (n, H) of these frames.
+        observed: hypotheses (n, H) of these frames.
         path: (n,) hypothesis of each frame, `NONE` if it was skipped.
         doubt: (n,) probability that head and tail are exchanged.
         measured: (n,) bool, where a hypothesis was selected.
@@ -194,16 +189,19 @@ def mask_and_flag(
         subject.T_arena_camera.inverse() @ track.joints_mm[there]
     )
     track.p_flip[there] = doubt[there]
-    _add_sight(track, seen, path, measured)
+    rows = np.flatnonzero(measured)
+    columns = observed.n_px, observed.centroid_mm, observed.centroid_px, observed.residual_mm
+    for name, values in zip(SIGHT, columns, strict=True):
+        getattr(track, name)[rows] = values[rows, path[rows]]
     track.bridged[:] = bridged
     limit = min(subject.doubtful_mm, MOST_ERROR * subject.length_mm)
     doubtful = strayed | (track.predicted_error_mm > limit)
     track.flag[measured] = np.where(doubtful, "doubtful", "")[measured]
-    track.flag[~measured & ~seen.has_depth] = "no_depth"
-    track.flag[seen.copies] = "repeated"
+    track.flag[~measured & ~observed.has_depth] = "no_depth"
+    track.flag[observed.copies] = "repeated"
 
 
-def covariance_of_root(curve: Curve) -> Array:
+def covariance_of_root(curve: SmoothedCurve) -> Array:
     """Covariance (n, 6, 6) of the root: rotation, rad, then translation, mm, in its own frame.
 
     First-order propagation: the joints' middle is off by `cov_middle_mm2`, and a small turn φ about
@@ -242,32 +240,7 @@ def stretch_of(stretch_sd: float, joints: Array) -> Array:
     return np.asarray(stretch_sd * np.linalg.norm(joints - joints[:, :1], axis=-1) / np.sqrt(3.0))
 
 
-def add_sight_of_copies(track: Track, seen: Observations, copies: NDArray[np.bool_]) -> None:
-    """Write the observations of the repeated images into their copies, in place.
-
-    Args:
-        track: n rows.
-        seen: hypotheses (n, H) of these frames.
-        copies: (n,) bool, frames whose depth image equals that of an earlier frame.
-    """
-    shown = seen.shown[copies]
-    for column in (track.n_foreground_px, track.centroid_mm, track.centroid_px, track.residual_mm):
-        column[copies] = column[shown]
-
-
-def _add_sight(
-    track: Track, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
-) -> None:
-    """Add the observations of the animal to measured rows."""
-    rows = np.flatnonzero(measured)
-    taken = path[measured]
-    track.n_foreground_px[rows] = seen.n_px[rows, taken]
-    track.centroid_mm[rows] = seen.centroid_mm[rows, taken]
-    track.centroid_px[rows] = seen.centroid_px[rows, taken]
-    track.residual_mm[rows] = seen.residual_mm[rows, taken]
-
-
-def single_frames(subject: Subject, seen: Observations) -> Track:
+def single_frames(subject: Subject, observed: Observations) -> Track:
     """The track of single frames, without their neighbours: the first hypothesis of each.
 
     No association, no smoothing and no bridging; p_flip is 0 throughout. The spread is that of one
@@ -275,26 +248,28 @@ def single_frames(subject: Subject, seen: Observations) -> Track:
 
     Args:
         subject: the animal of the track; its `bridge_s` is not used.
-        seen: hypotheses (n, H), arena frame.
+        observed: hypotheses (n, H), arena frame.
 
     Returns:
         A track of n rows, NaN if a frame has no first hypothesis.
     """
-    path = np.where(seen.known[:, 0], 0, NONE)
-    pose = seen.pose(path)
-    error = seen.along(seen.error_mm, path)
+    path = np.where(observed.known[:, 0], 0, NONE)
+    pose = observed.pose(path)
+    error = observed.along(observed.error_mm, path)
     moves = TrackingParameters.of(subject.skeleton.name).motion.packed
     turn, bend = (
         group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend)
     )
     middle = (moves.position_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
-    curve = Curve(pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0)
-    return to_track(replace(subject, bridge_s=0.0), seen, path, curve, np.zeros(len(seen)))
+    curve = SmoothedCurve(
+        pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0
+    )
+    return to_track(replace(subject, bridge_s=0.0), observed, path, curve, np.zeros(len(observed)))
 
 
 def doubted(
     subject: Subject,
-    seen: Observations,
+    observed: Observations,
     path: NDArray[np.int64],
     in_view: Array,
     usual_px: float,
@@ -305,12 +280,12 @@ def doubted(
 
     Args:
         subject: the animal of the track.
-        seen: hypotheses (n, H).
+        observed: hypotheses (n, H).
         path: (n,) hypothesis of each frame, `NONE` if it was skipped.
         in_view: (n,) visible share of the animal.
         usual_px: its usual number of pixels.
     """
-    found = contradicted(seen, path, subject.length_mm) | (in_view < WHOLE)
+    found = contradicted(observed, path, subject.length_mm) | (in_view < WHOLE)
     if subject.n_animals > 1:
-        found |= together(seen, path, usual_px)
+        found |= together(observed, path, usual_px)
     return found

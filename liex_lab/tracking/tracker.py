@@ -27,15 +27,14 @@ from liex_lab.runtime.threads import threads
 from liex_lab.scene.background import has_noise
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.height_maps import HeightMaps, Patches, Segmenter
-from liex_lab.tracking.motion_model import TrackingParameters
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occlusion import OcclusionCorrection, behind_something
-from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.own_shape import OwnShape, StatedShape, fit_shape
-from liex_lab.tracking.residual import Agreement, BodyResidual, SampleFit, count_animals
-from liex_lab.tracking.track import Flip, Subject, Track, Tracked
-from liex_lab.tracking.track_rows import single_frames
-from liex_lab.tracking.trust import WHOLE, in_view, median_of_whole
+from liex_lab.tracking.residual import BodyAgreement, BodyResidual, SampleFit, count_animals
+from liex_lab.tracking.smoother import TrackingParameters
+from liex_lab.tracking.track import Flip, Subject, Tracked
+from liex_lab.tracking.trust import WHOLE, finite_median, median_of_whole, visible_share
 
 BRIDGE_S = 0.5
 _MOST_COUNTED = 24  # frames in which animals are counted
@@ -108,7 +107,9 @@ class FrameTracker:
         Raises:
             EstimationError: no sampled frame shows an animal.
         """
-        home = estimator.skeleton.length
+        skeleton = estimator.skeleton
+        method = estimator.model.method
+        home = skeleton.length
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
         estimates = estimator.estimate(sample, scene, size)
         whole = _whole(scene, sample, estimates)
@@ -117,60 +118,43 @@ class FrameTracker:
             sample = sample[whole]
             size = size if spine_mm else estimator.find_size(sample, scene)
             estimates = estimator.estimate(sample, scene, size)
-        if not estimates.found.any():
+        used = estimates.found
+        if not used.any():
             raise EstimationError(
                 "no animal was found in the sampled frames; check the depth unit and the plan"
             )
-        pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)
-        crops = estimates.crops
-        used = estimates.found
-        shown = sample if used.all() else sample[used]  # copies about a hundred depth images
-        camera_view = estimator.model.method.camera_view
-        average = Surface.of(estimator.skeleton)
-        body = (
-            BodyResidual.fit(average, pose[used], crops[used], scene, camera_view, size)
-            if stated is None or stated.girth is None
-            else BodyResidual(average, stated.girth, camera_view, size)
-        )
-        shape = None
-        if adapt:
-            prior = ShapePrior.of(estimator.skeleton.name)
-            shape, body = fit_shape(prior, estimator, scene, estimates, size, body, stated)
+        body, shape = _body_of(estimator, scene, estimates, size, adapt, stated)
+        pose = estimates.chosen.pose
         if shape is not None:
-            pose = shape.corrected(estimator, estimates.chosen.pose, size).moved(
-                scene.floor.T_arena_camera
-            )
-        limit = doubtful_mm or estimator.model.calibration.doubtful_mm * size
-        agreement = body.agreement(pose[used], crops[used], scene)
-        misfit = agreement.residual_mm[np.isfinite(agreement.residual_mm)]
-        blur = float(np.median(misfit)) / (home * size) if len(misfit) else 0.0
-        spread = float(np.log(estimator.sizes_by_frame(estimates)).std())
-        ends = None
-        if (
-            camera_view and estimator.skeleton.is_chain
-        ):  # animals on the floor are recorded from above and may rear
-            ends = OcclusionCorrection.fit(
-                estimator.skeleton, scene, estimates.chosen.pose[used], crops[used], shown
-            )
-        fit = SampleFit.of(
+            pose = shape.corrected(estimator, pose, size)
+        crops = estimates.crops[used]
+        shown = sample if used.all() else sample[used]  # copies about a hundred depth images
+        agreement = body.agreement(pose.moved(scene.floor.T_arena_camera)[used], crops, scene)
+        # animals on the floor are recorded from above and may rear
+        swims = method.camera_view and skeleton.is_chain
+        fit = SampleFit(
             sum(has_readings(image) for image in sample),
+            int(used.sum()),
             size * home,
-            estimates.chosen.error_mm[used],
-            agreement,
-            _count(estimator, scene, shown, size, body, agreement, crops.n_blobs[used]),
+            float(np.median(estimates.chosen.error_mm[used])),
+            finite_median(agreement.residual_mm, np.nan),
+            float(np.median(agreement.covered)),
+            float(np.median(agreement.beside)),
+            _count(estimator, scene, shown, size, body, agreement, crops.n_blobs),
         )
-        origin = "plan" if spine_mm else "recording"
         return FrameTracker(
             estimator,
             scene,
             size,
-            origin,
+            "plan" if spine_mm else "recording",
             body,
-            limit,
+            doubtful_mm or estimator.model.calibration.doubtful_mm * size,
             bridge_s,
-            blur,
-            spread,
-            ends,
+            finite_median(agreement.residual_mm, 0.0) / (home * size),
+            float(np.log(estimator.sizes_by_frame(estimates)).std()),
+            OcclusionCorrection.fit(skeleton, scene, estimates.chosen.pose[used], crops, shown)
+            if swims
+            else None,
             fit,
             shape,
             has_noise(sample),
@@ -186,6 +170,7 @@ class FrameTracker:
         """The animal of the track, with the limits and shares of this recording."""
         skeleton = self.estimator.skeleton
         share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
+        motion = TrackingParameters.of(skeleton.name).motion
         return Subject(
             skeleton,
             self.scene.camera,
@@ -194,16 +179,10 @@ class FrameTracker:
             self.doubtful_mm,
             self.bridge_s,
             share,
-            self.stretch_sd,
+            motion.stretch_sd(self.blur, self.size_spread),
             self.shape.build.unseen if self.shape and self.shape.build else None,
             1 if self.sample_fit is None else self.sample_fit.n_animals,
         )
-
-    @property
-    def stretch_sd(self) -> float:
-        """Standard deviation of the relative error of lengths, see `Subject`."""
-        motion = TrackingParameters.of(self.estimator.skeleton.name).motion
-        return motion.stretch_sd(self.blur, self.size_spread)
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
         """The pose hypotheses of consecutive frames, one frame at a time.
@@ -218,61 +197,38 @@ class FrameTracker:
         """
         depths = stacked(frames)
         times = np.array([frame.time_ns for frame in frames], np.int64)
-        seen = Observations.empty(self.estimator.skeleton, times)
-        seen.has_depth[:] = [has_readings(depth) for depth in depths]
-        seen.repeats[:] = [frame.repeats for frame in frames]
-        with threads(
-            len(frames) > 1
-        ):  # kernels distribute frames over cores: with one frame the others would idle
+        observed = Observations.empty(self.estimator.skeleton, times)
+        observed.has_depth[:] = [has_readings(depth) for depth in depths]
+        observed.repeats[:] = [frame.repeats for frame in frames]
+        # kernels distribute frames over cores: with one frame the others would idle
+        with threads(len(frames) > 1):
             hypotheses = self.estimator.hypotheses(depths, self.scene, self.size)
-            cleared = self.scene.cleared(depths)
-            poses = [
-                self._put(seen, h, estimates, depths) for h, estimates in enumerate(hypotheses)
-            ]
-            self._put_agreement(seen, hypotheses, poses, cleared)
+            poses = [self._put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
+            self._put_agreement(observed, hypotheses, poses, self.scene.cleared(depths))
         if self.noisy:
-            seen.forget(seen.repeats)
-        return seen
-
-    def follow(self, frames: Sequence[DepthFrame]) -> Track:
-        """The track of consecutive frames, one frame at a time, without smoothing.
-
-        Args:
-            frames: at least one.
-
-        Returns:
-            A track of n rows.
-        """
-        return self.follow_again(self.observe(frames))
-
-    def follow_again(self, seen: Observations) -> Track:
-        """The same as `follow`, from the frames' observations.
-
-        Args:
-            seen: result of `observe`.
-
-        Returns:
-            A track of n rows.
-        """
-        return single_frames(self.subject, seen)
+            observed.forget(observed.repeats)
+        return observed
 
     def track(
-        self, seen: Observations, corrections: Sequence[Flip] = (), allocate: Allocator = np.empty
+        self,
+        observed: Observations,
+        corrections: Sequence[Flip] = (),
+        allocate: Allocator = np.empty,
     ) -> Tracked:
         """The smoothed track of a whole recording, see `offline.track_whole`.
 
         Args:
-            seen: result of `observe` for all frames.
+            observed: result of `observe` for all frames.
             corrections: spans that a person marked as having head and tail exchanged.
             allocate: allocator of the track's columns.
 
         Returns:
             The track and its head-tail flips.
         """
-        return track_whole(self.subject, seen, corrections, allocate=allocate)
+        return track_whole(self.subject, observed, corrections, allocate=allocate)
 
     def _put(
-        self, seen: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
+        self, observed: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
     ) -> Pose:
         """Set estimates as hypothesis h, with their component's pixels and centroid.
 
@@ -280,30 +236,28 @@ class FrameTracker:
         """
         found = np.flatnonzero(estimates.found)
         chosen = estimates.chosen
+        pose = chosen.pose
         if not len(found):
-            return chosen.pose
+            return pose
         crops = estimates.crops
-        in_camera = (
-            chosen.pose
-            if self.free_ends is None
-            else self.free_ends.slid(chosen.pose, crops, depths)
-        )
+        if self.free_ends is not None:
+            pose = self.free_ends.slid(pose, crops, depths)
         if self.shape is not None:
-            in_camera = self.shape.corrected(self.estimator, in_camera, self.size)
-        pose = in_camera.moved(self.scene.floor.T_arena_camera)
-        seen.put_pose(h, pose)
-        seen.error_mm[:, h] = chosen.error_mm
-        seen.score[:, h] = chosen.score
-        seen.n_px[found, h] = crops.n_px[found]
+            pose = self.shape.corrected(self.estimator, pose, self.size)
+        pose = pose.moved(self.scene.floor.T_arena_camera)
+        observed.put_pose(h, pose)
+        observed.error_mm[:, h] = chosen.error_mm
+        observed.score[:, h] = chosen.score
+        observed.n_px[found, h] = crops.n_px[found]
         centre = self.scene.middles(crops[found], self.estimator.model.method.camera_view)
-        seen.centroid_mm[found, h] = centre
+        observed.centroid_mm[found, h] = centre
         from_camera = self.scene.floor.T_arena_camera.inverse() @ centre
-        seen.centroid_px[found, h] = self.scene.camera.project(from_camera)
+        observed.centroid_px[found, h] = self.scene.camera.project(from_camera)
         return pose
 
     def _put_agreement(
         self,
-        seen: Observations,
+        observed: Observations,
         hypotheses: Sequence[Estimates],
         poses: Sequence[Pose],
         cleared: NDArray[np.float32],
@@ -315,26 +269,47 @@ class FrameTracker:
         """
         rows = [np.flatnonzero(one.found) for one in hypotheses]
         best = [h for h in range(0, len(hypotheses), 2) if len(rows[h])]
-        columns = (seen.residual_mm, seen.covered, seen.beside, seen.part_mm)
+        columns = (observed.residual_mm, observed.covered, observed.beside, observed.part_mm)
         if best:
-            told = self.body.agreement(
+            agreement = self.body.agreement(
                 Pose.join([poses[h][rows[h]] for h in best]),
                 HeightMaps.join([hypotheses[h].crops[rows[h]] for h in best]),
                 self.scene,
             )
             hypothesis = np.repeat(best, [len(rows[h]) for h in best])
             frame = np.concatenate([rows[h] for h in best])
-            for column, values in zip(
-                columns, (told.residual_mm, told.covered, told.beside, told.part_mm), strict=True
-            ):
+            for column, values in zip(columns, vars(agreement).values(), strict=True):
                 column[frame, hypothesis] = values
         for h in best:
             # for all frames: discarding unused values is cheaper than copying depth images
-            behind = behind_something(hypotheses[h].crops, cleared)
-            seen.behind[rows[h], h] = behind[rows[h]]
+            observed.behind[rows[h], h] = behind_something(hypotheses[h].crops, cleared)[rows[h]]
             # the reversed body covers nearly the same pixels
-            for column in (*columns, seen.behind):
+            for column in (*columns, observed.behind):
                 column[rows[h + 1], h + 1] = column[rows[h + 1], h]
+
+
+def _body_of(
+    estimator: PoseEstimator,
+    scene: Segmenter,
+    estimates: Estimates,
+    size: float,
+    adapt: bool,
+    stated: StatedShape | None,
+) -> tuple[BodyResidual, OwnShape | None]:
+    """The body that sampled frames are compared with, and the session's own shape."""
+    used = estimates.found
+    average = Surface.of(estimator.skeleton)
+    camera_view = estimator.model.method.camera_view
+    if stated is not None and stated.girth is not None:
+        body = BodyResidual(average, stated.girth, camera_view, size)
+    else:
+        pose = estimates.chosen.pose.moved(scene.floor.T_arena_camera)[used]
+        body = BodyResidual.fit(average, pose, estimates.crops[used], scene, camera_view, size)
+    if not adapt:
+        return body, None
+    prior = ShapePrior.of(estimator.skeleton.name)
+    shape, body = fit_shape(prior, estimator, scene, estimates, size, body, stated)
+    return body, shape
 
 
 def _whole(
@@ -350,8 +325,8 @@ def _whole(
         crops = replace(crops, origin=crops.origin // scene.stride, step=crops.step // scene.stride)
     behind = behind_something(crops, scene.cleared(sample))
     shown = np.where(estimates.found, crops.n_px, np.nan)
-    usual_px = median_of_whole(shown, behind)
-    return ~estimates.found | (in_view(behind, shown, usual_px, 0) >= WHOLE)
+    share = visible_share(behind, shown, median_of_whole(shown, behind), 0)
+    return ~estimates.found | (share >= WHOLE)
 
 
 def _count(
@@ -360,7 +335,7 @@ def _count(
     sample: NDArray[np.float32],
     size: float,
     body: BodyResidual,
-    first: Agreement,
+    first: BodyAgreement,
     n_candidates: NDArray[np.int64],
 ) -> int:
     """How many animals are in view at once in a sample (n, H, W) mm of frames with an animal.
@@ -376,16 +351,13 @@ def _count(
     other = estimator.hypotheses(sample[rows], scene, size)[2]
     there = other.found
     pose = other.chosen.pose.moved(scene.floor.T_arena_camera)[there]
-    own = body
+    crops = other.crops[there]
     if there.any():  # another animal has its own girth and size
-        own = BodyResidual.fit(
-            Surface.of(estimator.skeleton), pose, other.crops[there], scene, body.camera_view
-        )
-    second = own.agreement(pose, other.crops[there], scene)
-    n = (
-        len(n_candidates) * len(rows) // len(unsure)
-    )  # scaled from the inspected frames to all frames
-    return count_animals(first, second, rows[there], n)
+        surface = Surface.of(estimator.skeleton)
+        body = BodyResidual.fit(surface, pose, crops, scene, body.camera_view)
+    # scaled from the inspected frames to all frames
+    n = len(n_candidates) * len(rows) // len(unsure)
+    return count_animals(first, body.agreement(pose, crops, scene), rows[there], n)
 
 
 # Pose hypotheses of patches of depth around animals, like `FrameTracker.observe` of frames.
@@ -422,17 +394,14 @@ class PatchObserver:
         """
         model = self.estimator.model
         size = 1.0
-        uncorrected = replace(
-            self, estimator=replace(self.estimator, model=replace(model, corrector=None))
-        )
+        uncorrected = replace(self.estimator, model=replace(model, corrector=None))
         for _ in range(_SIZE_PASSES if model.method.session_size else 0):
-            best = uncorrected.estimator.best_of(*uncorrected._cut(windows, size), size)
-            seen = np.flatnonzero(best.found)
-            if not len(seen):
+            best = uncorrected.best_of(*self._cut(windows, size), size)
+            found = np.flatnonzero(best.found)
+            if not len(found):
                 return 1.0
-            sure = seen[
-                np.argsort(-best.chosen.scale_trust[seen])[: max(8, int(_SURE * len(seen)))]
-            ]
+            order = np.argsort(-best.chosen.scale_trust[found])
+            sure = found[order[: max(8, int(_SURE * len(found)))]]
             size = float(np.median(best.chosen.frame_scale[sure]))
         return size
 
@@ -449,22 +418,21 @@ class PatchObserver:
         Returns:
             Observations of n frames, with hypotheses 0 and 1; centroids and residuals are NaN.
         """
-        seen = Observations.empty(self.estimator.skeleton, times_ns)
+        observed = Observations.empty(self.estimator.skeleton, times_ns)
         start = 0
         for windows in parts:
             place = windows.floor(0).T_arena_camera
             rows = slice(start, start + len(windows.depth))
             # a view: writes change the whole
             start = rows.stop
-            some = seen[rows]
-            for h, estimates in enumerate(
-                self.estimator.both_directions(*self._cut(windows, size), size)
-            ):
+            some = observed[rows]
+            detection = self.estimator.candidates(*self._cut(windows, size), size)
+            for h, estimates in enumerate(self.estimator.both_directions([detection], size)):
                 some.put_pose(h, estimates.chosen.pose.moved(place))
                 some.error_mm[:, h] = estimates.chosen.error_mm
                 some.score[:, h] = estimates.chosen.score
                 some.n_px[:, h] = np.where(estimates.found, estimates.crops.n_px, 0)
-        return seen
+        return observed
 
     def subject(self, camera: Camera, T_arena_camera: SE3, size: float) -> Subject:
         """The subject of a track from such patches.

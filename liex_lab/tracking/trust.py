@@ -14,13 +14,13 @@ The limits were set on virtual recordings of the mouse, the fish and the hand wi
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import Skeleton
 from liex_lab.tracking.observations import Observations, joints_of
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Track, spans
 
 Array = NDArray[np.float64]
 
@@ -32,8 +32,7 @@ _TIMES_RESIDUAL = 4.0  # of the session's own usual residual
 _LEAST_COVERED = 0.35
 _MOST_BESIDE = 0.6
 # smallest and largest share of the usual pixels of a fully visible animal
-_LEAST_SHOWN = 0.6
-_MOST_SHOWN = 1.6
+_SHOWN = (0.6, 1.6)
 # one object is two animals if it has the usual pixels plus this share of the other's, and at least
 # this multiple of the usual ones: where both touch, each hides a part of the other
 _OF_OTHER = 0.4
@@ -57,47 +56,54 @@ _ELSEWHERE = 0.25
 
 
 def contradicted(
-    seen: Observations, path: NDArray[np.int64], length_mm: float
+    observed: Observations, path: NDArray[np.int64], length_mm: float
 ) -> NDArray[np.bool_]:
     """Whether (n,) the depth image contradicts the pose of a frame's own hypothesis.
 
     Args:
-        seen: hypotheses (n, H) of the frames.
+        observed: hypotheses (n, H) of the frames.
         path: (n,) index of the hypothesis, negative for none.
         length_mm: of the animal.
 
     Returns:
         False if there is no hypothesis, or its agreement with the depth image is unknown.
     """
-    residual = seen.along(seen.residual_mm, path)
-    known = residual[np.isfinite(residual)]
-    usual = float(np.median(known)) if len(known) else 0.0
+    residual = observed.along(observed.residual_mm, path)
+    usual = finite_median(residual, 0.0)
     limit = min(
         max(_TIMES_RESIDUAL * usual, _ALWAYS_RESIDUAL * length_mm), MOST_RESIDUAL * length_mm
     )
     with np.errstate(invalid="ignore"):
         return np.asarray(
             (residual > limit)
-            | (seen.along(seen.part_mm, path) > MOST_RESIDUAL * length_mm)
-            | (seen.along(seen.covered, path) < _LEAST_COVERED)
-            | (seen.along(seen.beside, path) > _MOST_BESIDE)
+            | (observed.along(observed.part_mm, path) > MOST_RESIDUAL * length_mm)
+            | (observed.along(observed.covered, path) < _LEAST_COVERED)
+            | (observed.along(observed.beside, path) > _MOST_BESIDE)
         )
 
 
-def usual_pixels(seen: Observations, path: NDArray[np.int64]) -> float:
+def finite_median(values: Array, otherwise: float) -> float:
+    """The median of the finite values, or another number if there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else otherwise
+
+
+def usual_pixels(observed: Observations, path: NDArray[np.int64]) -> float:
     """The animal's usual number of pixels when it is unobstructed.
 
     The median along a path over the frames in which its outline does not end at a nearer object, or
     over all frames if fewer than 12 of them qualify.
 
     Args:
-        seen: hypotheses (n, H) of the frames.
+        observed: hypotheses (n, H) of the frames.
         path: (n,) index of the hypothesis, negative for none.
 
     Returns:
         The pixels; 0 if the path is empty.
     """
-    return median_of_whole(seen.along(seen.n_px, path), seen.along(seen.behind, path))
+    return median_of_whole(
+        observed.along(observed.n_px, path), observed.along(observed.behind, path)
+    )
 
 
 def median_of_whole(shown: Array, behind: Array) -> float:
@@ -110,46 +116,45 @@ def median_of_whole(shown: Array, behind: Array) -> float:
     Returns:
         The median; 0 if none is known.
     """
-    known = np.isfinite(shown)
-    whole = known & (np.nan_to_num(behind) <= _BEHIND)
-    taken = whole if whole.sum() >= _FEWEST_WHOLE else known
-    return float(np.median(shown[taken])) if taken.any() else 0.0
+    whole = np.isfinite(shown) & (np.nan_to_num(behind) <= _BEHIND)
+    return finite_median(shown[whole] if whole.sum() >= _FEWEST_WHOLE else shown, 0.0)
 
 
-def together(seen: Observations, path: NDArray[np.int64], usual_px: float) -> NDArray[np.bool_]:
+def together(observed: Observations, path: NDArray[np.int64], usual_px: float) -> NDArray[np.bool_]:
     """Whether (n,) an animal touches another, so that both are one component of the depth image.
 
     The size of both is estimated from the frames in which they are separate components.
 
     Args:
-        seen: hypotheses (n, H) of the frames.
+        observed: hypotheses (n, H) of the frames.
         path: (n,) index of the hypothesis, negative for none.
         usual_px: the animal's usual number of pixels.
     """
-    shown = seen.along(seen.n_px, path)
-    others = np.where(seen.known & (seen.n_px != shown[:, None]), seen.n_px, 0).max(axis=1)
-    apart = (path >= 0) & (others > 0)
-    other_px = float(np.median(others[apart])) if apart.any() else np.inf
+    shown = observed.along(observed.n_px, path)
+    others = np.where(observed.known & (observed.n_px != shown[:, None]), observed.n_px, 0).max(
+        axis=1
+    )
+    other_px = finite_median(others[(path >= 0) & (others > 0)], np.inf)
     most_px = np.clip(
-        usual_px + _OF_OTHER * other_px, _LEAST_TOGETHER * usual_px, _MOST_SHOWN * usual_px
+        usual_px + _OF_OTHER * other_px, _LEAST_TOGETHER * usual_px, _SHOWN[1] * usual_px
     )
     return np.asarray((path >= 0) & (shown > most_px))
 
 
-def share_in_view(seen: Observations, path: NDArray[np.int64], usual_px: float) -> Array:
+def share_in_view(observed: Observations, path: NDArray[np.int64], usual_px: float) -> Array:
     """The visible share (n,) of an animal that is partly behind a nearer object.
 
     Args:
-        seen: hypotheses (n, H) of consecutive frames.
+        observed: hypotheses (n, H) of consecutive frames.
         path: (n,) index of the hypothesis; if negative, the first one is used.
         usual_px: the animal's usual number of pixels.
 
     Returns:
         1 if it is unobstructed, or if there is no hypothesis.
     """
-    meant = np.where((path < 0) & seen.known[:, 0], 0, path)
-    share = in_view(seen.along(seen.behind, meant), seen.along(seen.n_px, meant), usual_px)
-    return np.where(meant >= 0, share, 1.0)
+    meant = np.where((path < 0) & observed.known[:, 0], 0, path)
+    behind, shown = (observed.along(values, meant) for values in (observed.behind, observed.n_px))
+    return np.where(meant >= 0, visible_share(behind, shown, usual_px), 1.0)
 
 
 def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
@@ -165,7 +170,7 @@ def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
     return np.asarray((in_view < MOSTLY) | ((in_view < WHOLE) & (doubt > _UNSURE)))
 
 
-def in_view(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAMES) -> Array:
+def visible_share(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAMES) -> Array:
     """The visible share (n,) of an animal that is partly behind a nearer object.
 
     Args:
@@ -179,30 +184,29 @@ def in_view(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAM
     return np.where(most > _BEHIND, np.minimum(shown_px / max(usual_px, 1.0), 1.0), 1.0)
 
 
-def told_ends(seen: Observations) -> Array:
+def head_tail_weight(observed: Observations) -> Array:
     """The weight (n, H), 0 to 1, of each hypothesis as evidence for which end is the head.
 
     The metric was not trained on partly hidden animals, and confuses their ends in many consecutive
     frames: the weight is 0 if no more than 0.7 of the animal is visible.
 
     Args:
-        seen: hypotheses (n, H) of consecutive frames.
+        observed: hypotheses (n, H) of consecutive frames.
 
     Returns:
         1 if all of it is visible, or if there is no hypothesis.
     """
-    first = np.where(seen.known[:, 0], 0, -1)
-    usual_px = usual_pixels(seen, first)
-    told = np.ones(seen.score.shape)
-    for h in range(seen.score.shape[1]):
-        behind, shown = (values[:, h].astype(float) for values in (seen.behind, seen.n_px))
-        share = in_view(behind, shown, usual_px)
-        told[:, h] = np.clip((share - MOSTLY) / (WHOLE - MOSTLY), 0.0, 1.0) ** 2
-    return told
+    usual_px = usual_pixels(observed, np.where(observed.known[:, 0], 0, -1))
+    weight = np.ones(observed.score.shape)
+    for h in range(observed.score.shape[1]):
+        behind, shown = (values[:, h].astype(float) for values in (observed.behind, observed.n_px))
+        share = visible_share(behind, shown, usual_px)
+        weight[:, h] = np.clip((share - MOSTLY) / (WHOLE - MOSTLY), 0.0, 1.0) ** 2
+    return weight
 
 
 def gone_behind(
-    seen: Observations, measured: NDArray[np.bool_], usual_px: float
+    observed: Observations, measured: NDArray[np.bool_], usual_px: float
 ) -> NDArray[np.bool_]:
     """Whether (n,) the animal is hidden: it disappeared behind or under an object.
 
@@ -211,18 +215,17 @@ def gone_behind(
     begins with such a stretch, the frames after it decide.
 
     Args:
-        seen: hypotheses (n, H) of all frames.
+        observed: hypotheses (n, H) of all frames.
         measured: (n,) whether a pose was measured.
         usual_px: the animal's usual number of pixels.
     """
-    hidden = np.zeros(len(seen), np.bool_)
-    known = np.asarray(seen.known.any(axis=1))
-    shown = np.where(known, seen.n_px.max(axis=1), 0) / max(usual_px, 1.0)
-    behind = np.where(known, np.nan_to_num(seen.behind).max(axis=1), 0.0)
-    seconds = seen.seconds
-    edges = np.flatnonzero(np.diff(np.concatenate([[1], measured, [1]]).astype(np.int8)))
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        gone = start + np.flatnonzero(~known[start:stop] & seen.has_depth[start:stop])
+    hidden = np.zeros(len(observed), np.bool_)
+    known = np.asarray(observed.known.any(axis=1))
+    shown = np.where(known, observed.n_px.max(axis=1), 0) / max(usual_px, 1.0)
+    behind = np.where(known, np.nan_to_num(observed.behind).max(axis=1), 0.0)
+    seconds = observed.seconds
+    for start, stop in spans(~measured):
+        gone = start + np.flatnonzero(~known[start:stop] & observed.has_depth[start:stop])
         if not len(gone):
             continue
         before = np.flatnonzero(known[: gone[0]])
@@ -231,19 +234,18 @@ def gone_behind(
         else:
             after = gone[0] + np.flatnonzero(known[gone[0] :])
             near = after[seconds[after] <= seconds[after[:1]] + _SHORTLY_S]
-        if _was_going(shown[near], behind[near]):
-            hidden[start:stop] = True
+        hidden[start:stop] = disappears(shown[near], behind[near])
     return hidden
 
 
-def _was_going(shown: Array, behind: Array) -> bool:
-    """Whether frames (k,) show an animal that disappears: fewer pixels, and an outline that ends at
-    a nearer object.
+def disappears(shown: Array, behind: Array) -> bool:
+    """Whether frames (k,) show an animal that disappears: fewer pixels, over the usual ones, and an
+    outline that ends at a nearer object.
     """
     return len(shown) > 0 and bool(shown.min() < _GOING and behind.max() > _BEHIND)
 
 
-class Watch:
+class OcclusionMonitor:
     """`gone_behind` during a recording, frame by frame, from past frames only.
 
     Without later frames, an animal that is hidden at the beginning counts as not found.
@@ -263,50 +265,74 @@ class Watch:
         return median_of_whole(*np.array(self._shown).T) if self._shown else None
 
     def gone(
-        self, seen: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
+        self, observed: Observations, path: NDArray[np.int64], measured: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Whether (n,) the animal is hidden in the next frames, see `gone_behind`.
 
         Args:
-            seen: hypotheses (n, H) of consecutive frames, the first the one after the last.
+            observed: hypotheses (n, H) of consecutive frames, the first the one after the last.
             path: (n,) index of the hypothesis, negative for none.
             measured: (n,) whether a pose was measured.
         """
-        known = np.asarray(seen.known.any(axis=1))
-        behind = np.nan_to_num(seen.behind)
-        hidden = np.zeros(len(seen), np.bool_)
-        for k, time_ns in enumerate(seen.times_ns):
+        known = np.asarray(observed.known.any(axis=1))
+        behind = np.nan_to_num(observed.behind)
+        hidden = np.zeros(len(observed), np.bool_)
+        for k, time_ns in enumerate(observed.times_ns):
             now_s = 1e-9 * float(time_ns)
             if measured[k]:
-                self._shown.append((float(seen.n_px[k, path[k]]), float(behind[k, path[k]])))
+                self._shown.append((float(observed.n_px[k, path[k]]), float(behind[k, path[k]])))
                 self._lost = self._gone = False
             if known[k]:
-                self._near.append((now_s, int(seen.n_px[k].max()), float(behind[k].max())))
+                self._near.append((now_s, int(observed.n_px[k].max()), float(behind[k].max())))
             while self._near and self._near[0][0] < now_s - _SHORTLY_S:
                 self._near.popleft()
-            if not known[k] and seen.has_depth[k] and not self._lost:
+            if not known[k] and observed.has_depth[k] and not self._lost:
                 _, shown, near = np.array([*self._near]).reshape(-1, 3).T
                 self._lost = True
-                self._gone = _was_going(shown / max(self.usual_px or 0.0, 1.0), near)
+                self._gone = disappears(shown / max(self.usual_px or 0.0, 1.0), near)
             hidden[k] = self._gone
         return hidden
 
 
-def elsewhere(
-    skeleton: Skeleton,
-    seen: Observations,
+def distances(
+    observed: Observations,
     joints_mm: Array,
-    error_mm: Array,
-    length_mm: float,
+    where: NDArray[np.bool_],
     usual_px: float,
+    sizes: tuple[float, float],
+) -> Iterator[tuple[int, NDArray[np.int64], Array, Array]]:
+    """Mean joint distances of hypotheses from other poses of their frames.
+
+    Args:
+        observed: hypotheses (n, H) of the frames.
+        joints_mm: (n, J, 3) the poses, arena frame, mm.
+        where: (n,) the frames to compare.
+        usual_px: the animal's usual number of pixels.
+        sizes: least and most pixels of a hypothesis, over the usual ones.
+
+    Yields:
+        For each number of a hypothesis the frames (k,) that have it, its pixels over the usual
+        ones, and its distances, mm.
+    """
+    for h in range(observed.score.shape[1]):
+        shown = observed.n_px[:, h] / max(usual_px, 1.0)
+        least, most = sizes
+        rows = np.flatnonzero(where & observed.known[:, h] & (shown >= least) & (shown <= most))
+        if len(rows):
+            own = joints_of(observed.skeleton, observed.pose(np.full(len(observed), h))[rows])
+            off = np.linalg.norm(own - joints_mm[rows], axis=-1).mean(axis=1)
+            yield h, rows, shown[rows], off
+
+
+def elsewhere(
+    observed: Observations, joints_mm: Array, error_mm: Array, length_mm: float, usual_px: float
 ) -> NDArray[np.bool_]:
     """Whether (n,) a pose differs from all hypotheses of its frame while the animal is in view.
 
     Both directions are compared, because the head is decided from several frames.
 
     Args:
-        skeleton: kinematic tree of the animal.
-        seen: hypotheses (n, H) of the frames.
+        observed: hypotheses (n, H) of the frames.
         joints_mm: (n, J, 3) the poses, arena frame, mm; NaN if absent.
         error_mm: (n,) their predicted errors, mm.
         length_mm: of the animal.
@@ -315,23 +341,13 @@ def elsewhere(
     Returns:
         False if no object of the animal's size is in full view, or if there is no pose.
     """
-    nearest = np.full(len(seen), np.inf)
-    allowed = np.zeros(len(seen))
-    for h in range(seen.score.shape[1]):
-        shown = seen.n_px[:, h] / max(usual_px, 1.0)
-        rows = np.flatnonzero(
-            seen.known[:, h]
-            & np.isfinite(error_mm)
-            & (shown >= _LEAST_SHOWN)
-            & (shown <= _MOST_SHOWN)
-        )
-        if not len(rows):
-            continue
-        own = joints_of(skeleton, seen.pose(np.full(len(seen), h))[rows])
-        off = np.linalg.norm(own - joints_mm[rows], axis=-1).mean(axis=1)
+    nearest = np.full(len(observed), np.inf)
+    allowed = np.zeros(len(observed))
+    posed = np.isfinite(error_mm)
+    for h, rows, _, off in distances(observed, joints_mm, posed, usual_px, _SHOWN):
+        both = np.hypot(observed.error_mm[rows, h], error_mm[rows])
         nearer = off < nearest[rows]
         nearest[rows[nearer]] = off[nearer]
-        both = np.hypot(seen.error_mm[rows, h], error_mm[rows])
         allowed[rows[nearer]] = np.maximum(_TIMES_ERROR * both, _ELSEWHERE * length_mm)[nearer]
     return np.asarray(np.isfinite(nearest) & (nearest > allowed))
 

@@ -41,7 +41,7 @@ from liex_lab.scene.height_maps import Segmenter
 from liex_lab.sessions import Session
 from liex_lab.simulation import simulator, species
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.track import Track
 
 from ..build import build_scene, plan_of

@@ -37,8 +37,8 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Provenance, Session, SessionWriter, cutouts, evidence, mcap, rrd
 from liex_lab.sessions.writer import ReportMaker
 from liex_lab.tables.rows import Rows, stop_times
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.track import Subject
 
 from ..build import build_recording, build_tracker, kept_estimator

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, MisfitError
-from liex_lab.evaluation.scores import SCENES_PROTOCOL, Individual, Tally
+from liex_lab.evaluation.scores import SCENES_PROTOCOL, MeasuredIndividual, Tally
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
@@ -45,8 +45,10 @@ Case = tuple[
     str, str, str
 ]  # scene, bundled plan, and the row its error is divided by ('' for none)
 # individuals of all sessions that were written, problems or the sentence of a refusal, exit code
-Outcome = tuple[list[Individual], list[str], int]
-Draw = Callable[[str, "TrueRecording", Sequence["TrueAnimal"], Sequence[Individual]], object]
+Outcome = tuple[list[MeasuredIndividual], list[str], int]
+Draw = Callable[
+    [str, "TrueRecording", Sequence["TrueAnimal"], Sequence[MeasuredIndividual]], object
+]
 
 
 def cases() -> dict[str, Case]:
@@ -158,7 +160,7 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
                 refused = []
         except LiexError as error:
             return [], [str(error)], error.exit_code
-        individuals: list[Individual] = []
+        individuals: list[MeasuredIndividual] = []
         said: list[str] = []
         codes = [0, *(error.exit_code for error in refused)]
         for path in sorted(Path(folder).glob("*.liex")):
@@ -170,7 +172,7 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
     return individuals, [*said, *map(str, refused)], max(codes)
 
 
-def read_individuals(session: Session) -> list[Individual]:
+def read_individuals(session: Session) -> list[MeasuredIndividual]:
     """The individuals in a session's tables, in the frame of the camera of the original images."""
     T_camera_arena = session.T_arena_camera.inverse()
     mirrored = bool((session.metadata["camera"].get("optics") or {}).get("mirrored"))
@@ -183,5 +185,5 @@ def read_individuals(session: Session) -> list[Individual]:
         if mirrored:
             joints = joints * [-1.0, 1.0, 1.0]
         trusted = (frames["flag"] == "").to_numpy(bool) & np.isfinite(joints).all(axis=(1, 2))
-        found.append(Individual(joints, trusted))
+        found.append(MeasuredIndividual(joints, trusted))
     return found

@@ -43,7 +43,6 @@ from liex_lab.errors import LiexError, MissingPackageError
 from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.initial import draw_starts, start_poses
-from liex_lab.estimation.training import base_at_front
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
@@ -283,11 +282,8 @@ def _one_by_one(paper: PoseEstimator, footage: Footage) -> NDArray[Any]:
         crops.moments,
         draw_starts(np.random.default_rng(0), 1, k),
         np.ones((n, k)),
-        skeleton.length,
-        base_at_front(skeleton),
-        method.axis_start,
-        method.camera_view,
-        method.home_turn,
+        skeleton,
+        method,
     )
     poses = Candidates.start(
         skeleton,
@@ -310,8 +306,7 @@ def _stages_and_costs(
     view = default.model.method.camera_view
     crops = scene.extract(footage.frames, size, camera_view=view)
     cameras = scene.crop_cameras(crops, view)
-    rotations, positions, _, scores = default.candidates(crops, cameras, size)
-    images = ImageSet(crops.heights, cameras, crops.moments)
+    detection = default.candidates(crops, cameras, size)
 
     def ms(job: Callable[..., Any], *arguments: Any) -> float:
         return 1000.0 * best_seconds(partial(job, *arguments), N_REPEATS) / N_FRAMES
@@ -322,7 +317,7 @@ def _stages_and_costs(
     stages = {
         "foreground": ms(scene.extract, footage.frames, size, False, view),
         "candidates": candidates_ms(default),
-        "choice": ms(default.pick, images, size, rotations, positions, scores, False),
+        "choice": ms(default.pick, detection, size, False),
     }
     n_joints = len(default.skeleton.solved)
     sizes = [footage.every(step) for step in _SHRINK]

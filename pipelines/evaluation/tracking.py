@@ -42,10 +42,11 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.simulation import simulator, tracking_sequences
+from liex_lab.tracking.curve import OnlineTracker
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.online import OnlineTracker
-from liex_lab.tracking.particles import ParticleFilter, ProcessNoise
+from liex_lab.tracking.particles import SEARCHED, ParticleFilter, ProcessNoise
 from liex_lab.tracking.track import Track
+from liex_lab.tracking.track_rows import single_frames
 from liex_lab.tracking.tracker import FrameTracker
 
 from ..build import build_scene, plan_of
@@ -178,7 +179,7 @@ def follow_sequence(
         joints, tip = T @ track.joints_mm, estimator.skeleton.tip
         return Followed(joints, recording.joints_arena, track.sd_xyz_mm, n / seconds, tip)
 
-    rows = {"single": row(tracker.follow_again(observed), single_s)}
+    rows = {"single": row(single_frames(tracker.subject, observed), single_s)}
     progress(0, n, f"Algorithm 3 on {recording.name}")
     noise = ProcessNoise.of(estimator.skeleton.name)
     rows["algorithm3"] = follow(
@@ -313,7 +314,7 @@ def comparison(rows: Mapping[str, Mapping[str, Any]], animal: str) -> str:
     )
     gain = "is reproduced" if min(ratio.values()) < 1.0 else "is not reproduced"
     noise = "Its process noise was searched on other sequences."
-    if not all(ProcessNoise.searched(animal, "paper", n) for n in BASE_ROUNDS.values()):
+    if not all((animal, "paper", n) in SEARCHED for n in BASE_ROUNDS.values()):
         noise = (
             "Its process noise is set by hand and was not searched for these parts; "
             f"`liex train tracking --particles --animal {animal}` does."

@@ -35,7 +35,7 @@ from liex_lab.runtime.threads import in_background
 from liex_lab.sessions.corrections import DESCRIBED
 from liex_lab.sessions.folder import describe_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
-from liex_lab.tracking.own_shape import MOST_APART, Found, agree, spread_of
+from liex_lab.tracking.own_shape import MOST_APART, SessionBody, agree, spread_of
 
 from ..build import build_estimator, build_recording, open_planned, shape_labels
 from ..choice import fit_plan
@@ -276,7 +276,7 @@ def _why_not(look: Mapping[str, Any]) -> str:
     return ", and ".join(map(str, look["misfits"]))
 
 
-def found_in(look: Mapping[str, Any]) -> Found:
+def found_in(look: Mapping[str, Any]) -> SessionBody:
     """The findings on an animal, from `look_at` of a session that shows it.
 
     Raises:
@@ -285,7 +285,7 @@ def found_in(look: Mapping[str, Any]) -> Found:
     read = _Look.model_validate(look)
     shape = read.animal.shape or _ShapeFound()
     stated = shape.model_dump(include={"width", "height", "joints_moved"})
-    return Found(
+    return SessionBody(
         read.animal.spine_mm,
         read.stated,
         read.log_sd,

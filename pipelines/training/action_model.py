@@ -41,8 +41,8 @@ from liex_lab.simulation.agents import mouse as mouse_acts
 from liex_lab.simulation.agents.agent import STEP_S, CameraPath, Individual, Motion, render_agent
 from liex_lab.simulation.fish import FishSpecies
 from liex_lab.simulation.species import MouseSpecies
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.track import Subject
 from liex_lab.tracking.tracker import PatchObserver
 

@@ -38,9 +38,9 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation import corruptions, simulator, tracking_sequences
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.tracking.motion_model import TrackingParameters, tunings_with
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.smoother import TrackingParameters, tunings_with
 from liex_lab.tracking.track import Subject, Track
 from liex_lab.tracking.track_rows import single_frames, stretch_of
 from liex_lab.tracking.tracker import FrameTracker
@@ -61,7 +61,7 @@ _Z90 = 1.645
 _FACTORS = (0.3, 3.0)
 _HELD = (0.85, 0.96)  # bounds of the coverage of each joint's 90 % intervals, by kind
 _LEAST = 0.01
-# grids of the stretch's coefficients, see `Motion.stretch`
+# grids of the stretch's coefficients, see `MotionParameters.stretch`
 _PER_BLUR = np.arange(0.0, 6.5, 0.5)
 _PER_SPREAD = np.arange(0.0, 3.5, 0.5)
 _FOUND_OTHERWISE = (
@@ -348,7 +348,7 @@ def _cost(
 
 
 def with_motion(tuning: TrackingParameters, **changes: Any) -> TrackingParameters:
-    """The tuning with some fields of its `Motion` replaced."""
+    """The tuning with some fields of its `MotionParameters` replaced."""
     return replace(tuning, motion=replace(tuning.motion, **changes))
 
 
@@ -504,7 +504,7 @@ def calibrate_each_joint(
 
 
 def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
-    """`Motion.calibration`: factors at three levels of the stated error, by bisection.
+    """`MotionParameters.calibration`: factors at three levels of the stated error, by bisection.
 
     The frames are split into `_BINS` groups of equal size by their stated error. For each, f is the
     factor at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).

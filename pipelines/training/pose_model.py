@@ -30,23 +30,25 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines import cnn, forest
+from liex_lab.baselines import baseline, cnn
 from liex_lab.baselines.baseline import Baseline
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import FOREGROUNDS, Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.catalog import bundled_models, find_model
-from liex_lab.estimation.calibration import calibrate, with_corrector, with_facing, with_settler
-from liex_lab.estimation.cascade import ImageSet, Truth
+from liex_lab.estimation.cascade import ImageSet, TrainingSet, Truth
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import Method, method_of
 from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.estimation.training import (
     ProgressCallback,
-    TrainingSet,
+    calibrate,
     train_cascade,
     train_metric,
     train_pruner,
+    with_corrector,
+    with_facing,
+    with_settler,
 )
 from liex_lab.geometry import SE3
 from liex_lab.runtime.durable import replacing, write_whole
@@ -561,15 +563,15 @@ class Training:
     """
 
     recipe: Recipe
-    plan: forest.ForestPlan | cnn.CnnPlan
+    plan: baseline.ForestPlan | cnn.CnnPlan
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values of the training, a cache key: equal values mean equal training."""
         return {"recipe": vars(self.recipe), "plan": asdict(self.plan)}
 
 
-BASELINES: dict[str, forest.ForestPlan | cnn.CnnPlan] = {
-    "rf": forest.ForestPlan(),
+BASELINES: dict[str, baseline.ForestPlan | cnn.CnnPlan] = {
+    "rf": baseline.ForestPlan(),
     "cnn": cnn.CnnPlan(),
 }
 _SEEN = 122_880  # total views of the CNN, whatever the number of images
@@ -615,7 +617,7 @@ def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> 
         train_baseline(variant, skeleton, training, path, progress)
     if isinstance(training.plan, cnn.CnnPlan):
         return cnn.Cnn.load(path, skeleton, training.plan)
-    return forest.RegressionForest.load(path, skeleton, training.plan)
+    return baseline.RegressionForest.load(path, skeleton, training.plan)
 
 
 def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Path:
@@ -665,7 +667,7 @@ def train_baseline(
 
 def fit(
     training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback
-) -> forest.RegressionForest | cnn.Cnn:
+) -> baseline.RegressionForest | cnn.Cnn:
     """Train a baseline on rendered images.
 
     Raises:
@@ -674,4 +676,4 @@ def fit(
     rng = np.random.default_rng(training.recipe.seed)
     if isinstance(training.plan, cnn.CnnPlan):
         return cnn.train_cnn(data, skeleton, training.plan, rng, tell)
-    return forest.train_forests(data, skeleton, training.plan, rng, tell)
+    return baseline.train_forests(data, skeleton, training.plan, rng, tell)

@@ -27,16 +27,14 @@ from liex_lab.baselines.baseline import (
 )
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import PlanError
-from liex_lab.estimation.calibration import run_on
-from liex_lab.estimation.cascade import Candidates, Cascade
+from liex_lab.estimation.cascade import Candidates, Cascade, TrainingSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.initial import N_DIRECTIONS
 from liex_lab.estimation.method import Method, method_of
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.training import (
-    Proposals,
-    TrainingSet,
     joint_error,
+    run_on,
     start_candidates,
     train_cascade,
     train_metric,
@@ -137,7 +135,7 @@ def common_view(
     """
     scene, frames = build_scene(recording, plan, chooser.skeleton, len(recording))
     size = chooser.find_size(frames, scene)
-    second = chooser.second_is_animal(frames, scene, size)
+    *_, second = chooser.detect(frames, scene, size)
     alone = second_is_likelier(frames, scene)
     wrong, wrong_alone = (
         is_other(*chosen(frames, scene, 1.0, choice, True), recording) for choice in (second, alone)
@@ -557,7 +555,7 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
     proposals = None
     if (forest := model.cascade.proposals) is not None:
         k = min(k, N_DIRECTIONS * forest.n_trees)
-        proposals = Proposals(forest, np.zeros((forest.n_trees, n), np.bool_))  # no tree saw them
+        proposals = forest, np.zeros((forest.n_trees, n), np.bool_)  # no tree saw them
     method_k = replace(method, training_candidates=k)
     candidates = start_candidates(data, skeleton, method_k, np.random.default_rng(0), proposals)
     names, errors, positions = _follow(model.cascade, data, candidates)
