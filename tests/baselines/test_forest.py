@@ -14,13 +14,13 @@ from liex_lab.pipelines.training.pose_model import training_of
 
 from liex_lab.baselines import _kernels as kernels
 from liex_lab.baselines import baseline
-from liex_lab.baselines.forest import (
+from liex_lab.baselines.baseline import (
     ForestPlan,
     RegressionForest,
-    as_seen,
     coordinates,
     levers,
     train_forests,
+    with_home_turn,
 )
 from liex_lab.body.kinematics import KinematicTree
 from liex_lab.body.pose import Pose
@@ -127,7 +127,7 @@ def test_a_body_with_a_turned_home_has_the_same_poses(turn):
     angles[:, 0] = 0.0
     joints = Pose(root, angles, np.ones(6)).joints(skeleton)
     turned = SE3(root.rotation @ so3.exp(np.array(turn)).T, root.translation)
-    again = Pose(turned, angles, np.ones(6)).joints(as_seen(skeleton, turn))
+    again = Pose(turned, angles, np.ones(6)).joints(with_home_turn(skeleton, turn))
     np.testing.assert_allclose(again, joints, atol=1e-9)
 
 
@@ -223,7 +223,7 @@ def test_the_plain_mean_is_the_mean_of_all_candidates():
     second = baseline.second_is_likelier(toy.depths, SCENE)
     cut = baseline.chosen(toy.depths, SCENE, 1.0, second, True)
     crops, crop_cameras = cut
-    _, positions, _, _ = estimator.candidates(crops, crop_cameras, 1.0)
+    positions = estimator.candidates(crops, crop_cameras, 1.0).positions
     guesses = baseline.PlainMean(estimator).estimate(toy.depths, SCENE, 1.0)
     np.testing.assert_allclose(
         guesses.joints,

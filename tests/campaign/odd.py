@@ -21,7 +21,7 @@ import numpy as np
 from liex_lab.pipelines.evaluation.scenes import read_individuals
 from numpy.typing import NDArray
 
-from liex_lab.evaluation.scores import Individual
+from liex_lab.evaluation.scores import MeasuredIndividual
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from liex_lab.sessions import Session
@@ -286,7 +286,7 @@ def _odd_problems(session: Session) -> list[str]:
     return [one for one in session.metadata["problems"] if "recogniser" not in one]
 
 
-def _errors_mm(one: Individual, true: Array) -> Array:
+def _errors_mm(one: MeasuredIndividual, true: Array) -> Array:
     """Mean error of the joints in each frame that is trusted; infinite for another animal's."""
     if one.joints_camera.shape[1] != true.shape[1]:
         return np.full(int(one.trusted.sum()), np.inf)

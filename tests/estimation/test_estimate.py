@@ -46,12 +46,12 @@ def test_all_candidates_agree_with_the_slow_twin_of_algorithm_1(variant):
     estimator = PoseEstimator(model)
     crops = SCENE.extract(unseen().depths[:4], size, camera_view=model.method.camera_view)
     crop_cameras = SCENE.crop_cameras(crops, model.method.camera_view)
-    rotations, positions, scales, scores = estimator.candidates(crops, crop_cameras, size)
+    found = estimator.candidates(crops, crop_cameras, size)
     for i in range(4):
         picture = algorithm1.Picture(
             crops.heights[i], crop_cameras[i], crops.moments[i], size, model.method.reach_mm
         )
-        for k in range(scores.shape[1]):
+        for k in range(found.scores.shape[1]):
             drawn = estimator._starts[0, k]
             begun = (
                 algorithm1.seen_start(model, picture, k, size)
@@ -60,13 +60,12 @@ def test_all_candidates_agree_with_the_slow_twin_of_algorithm_1(variant):
             )
             twin = algorithm1.solve(model, picture, begun)
             np.testing.assert_allclose(
-                rotations[i, k], [joint[:3, :3] for joint in twin.joints], atol=1e-9
+                found.rotations[i, k], [joint[:3, :3] for joint in twin.joints], atol=1e-9
             )
             np.testing.assert_allclose(
-                positions[i, k], [joint[:3, 3] for joint in twin.joints], atol=1e-7
+                found.positions[i, k], [joint[:3, 3] for joint in twin.joints], atol=1e-7
             )
-            assert scales[i, k] == pytest.approx(twin.scale, rel=1e-12)
-            assert scores[i, k] == pytest.approx(twin.score, rel=1e-9)
+            assert found.scores[i, k] == pytest.approx(twin.score, rel=1e-9)
 
 
 def test_the_mode_of_votes_agrees_with_the_slow_twin_and_ignores_an_outlier():
@@ -138,21 +137,14 @@ def test_a_recording_in_which_nothing_is_found_is_all_nan_and_no_error(variant):
 @pytest.mark.parametrize(("variant", "limit_mm"), [("default", 2.0), ("paper", 3.5)])
 def test_poses_come_out_in_the_camera_frame_near_the_truth(variant, limit_mm):
     toy, estimator = unseen(), PoseEstimator(trained(variant).model)
-    estimates = estimator.estimate(toy.depths, SCENE, 1.0)
-    true = FLOOR.T_arena_camera.inverse() @ toy.joints
-    off = np.linalg.norm(estimates.chosen.pose.joints(estimator.skeleton) - true, axis=-1).mean(
-        axis=1
-    )
-    assert np.median(off) < limit_mm
-
-
-def test_the_chain_is_as_long_as_the_animals_spine():
-    toy, estimator = unseen(), PoseEstimator(trained("default").model)
     joints = estimator.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(toy.skeleton)
+    true = FLOOR.T_arena_camera.inverse() @ toy.joints
+    assert np.median(np.linalg.norm(joints - true, axis=-1).mean(axis=1)) < limit_mm
     length = np.linalg.norm(np.diff(joints, axis=1), axis=-1).sum(axis=1)
     off = length / (toy.pose.scale * toy.skeleton.length) - 1.0
-    assert np.median(np.abs(off)) < 0.04
-    assert abs(np.median(off)) < 0.02
+    if variant == "default":  # the paper's bones are of the session's size
+        assert np.median(np.abs(off)) < 0.04
+        assert abs(np.median(off)) < 0.02
 
 
 @pytest.mark.parametrize("true_size", [0.8, 1.0, 1.25])
@@ -180,12 +172,15 @@ def test_candidates_that_outlive_the_base_end_as_they_do_among_all():
     crop_cameras = SCENE.crop_cameras(crops)
     few = PoseEstimator(model).candidates(crops, crop_cameras, 1.0)
     all_of_them = PoseEstimator(model, unpruned=True).candidates(crops, crop_cameras, 1.0)
-    assert few[3].shape == (30, 3)
-    assert all_of_them[3].shape == (30, model.method.n_candidates)
+    assert few.scores.shape == (30, 3)
+    assert all_of_them.scores.shape == (30, model.method.n_candidates)
     for i in range(30):
-        same = np.abs(few[1][i][:, None] - all_of_them[1][i][None]).max(axis=(2, 3)) == 0.0
+        same = (
+            np.abs(few.positions[i][:, None] - all_of_them.positions[i][None]).max(axis=(2, 3))
+            == 0.0
+        )
         assert (same.sum(axis=1) == 1).all()
-        np.testing.assert_array_equal(few[3][i], all_of_them[3][i][same.argmax(axis=1)])
+        np.testing.assert_array_equal(few.scores[i], all_of_them.scores[i][same.argmax(axis=1)])
 
 
 def test_survivors_are_better_than_those_that_do_not_go_on_and_cost_little():
@@ -196,7 +191,7 @@ def test_survivors_are_better_than_those_that_do_not_go_on_and_cost_little():
     few, all_of_them = (
         PoseEstimator(model, unpruned=u).candidates(crops, crop_cameras, 1.0) for u in (False, True)
     )
-    assert few[3].mean() < all_of_them[3].mean()
+    assert few.scores.mean() < all_of_them.scores.mean()
     off = [
         np.linalg.norm(
             PoseEstimator(model, unpruned=u)
@@ -230,10 +225,8 @@ def test_more_candidates_may_be_asked_for_than_the_model_was_made_with():
     for n in (0, 2, 24):
         estimator = PoseEstimator(model, n)
         crops = SCENE.extract(depths, 1.0)
-        assert estimator.candidates(crops, SCENE.crop_cameras(crops), 1.0)[3].shape == (
-            40,
-            n or model.method.n_candidates,
-        )
+        found = estimator.candidates(crops, SCENE.crop_cameras(crops), 1.0)
+        assert found.scores.shape == (40, n or model.method.n_candidates)
         joints = estimator.estimate(depths, SCENE, 1.0).chosen.pose.joints(model.skeleton)
         off.append(np.linalg.norm(joints - true, axis=-1).mean())
     assert off[2] < off[1]

@@ -6,16 +6,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
-import pytest
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation.calibration import with_corrector
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.estimation.model import Model
+from liex_lab.estimation.training import with_corrector
 from tests.estimation.toy import SCENE, toy_mice, trained, training_set, unseen
 
 
@@ -58,18 +56,6 @@ def test_a_corrected_pose_keeps_the_proportions_of_the_bones():
     )
 
 
-def test_the_correction_comes_back_from_a_model_file(tmp_path: Path):
-    path = tmp_path / "mouse.npz"
-    path.write_bytes(corrected_model().to_bytes())
-    read = Model.load(path)
-    assert read.method == corrected_model().method
-    made = corrected_model().corrector
-    assert made is not None
-    assert read.corrector is not None
-    np.testing.assert_array_equal(read.corrector.nodes, made.nodes)
-    np.testing.assert_array_equal(errors(read), errors(corrected_model()))
-
-
 def test_equal_images_teach_equal_corrections():
     assert taught(60).to_bytes() == taught(60).to_bytes()
 
@@ -81,11 +67,3 @@ def test_an_animal_whose_skeleton_branches_has_none():
     assert not hand.is_chain
     branching = replace(model, cascade=replace(model.cascade, skeleton=hand), corrector=None)
     assert with_corrector(branching, trained("default").data, np.random.default_rng(0)) is branching
-
-
-@pytest.mark.parametrize("parallel", [False, True])
-def test_serial_and_parallel_agree(parallel: bool):
-    toy = unseen()
-    found = PoseEstimator(corrected_model()).estimate(toy.depths[:10], SCENE, 1.0, parallel)
-    whole = PoseEstimator(corrected_model()).estimate(toy.depths, SCENE, 1.0)
-    np.testing.assert_array_equal(found.chosen.pose.angles, whole.chosen.pose.angles[:10])

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.head_tail import UNSURE_MM, HeadTailClassifier, both_directions, laid_along
 from liex_lab.estimation.method import METHODS
-from liex_lab.estimation.model import Model
+from liex_lab.estimation.refine import UNSURE_MM, HeadTailClassifier, both_directions, laid_along
 from liex_lab.mlp import Network
 from tests.estimation.toy import SCENE, toy_mice, trained, training_set
 
@@ -118,7 +117,7 @@ def test_an_estimator_with_it_measures_as_before_where_it_was_sure(network):
     before, after = (
         e.estimate(toy.depths, SCENE, 1.0).chosen.pose.joints(e.skeleton) for e in (plain, told)
     )
-    sight = plain._detect_both(toy.depths, SCENE, 1.0, True)[0]
+    sight = plain.detect(toy.depths, SCENE, 1.0)[0]
     sure = ~(both_directions(sight.positions, sight.scores, plain.skeleton.tip)[2] < UNSURE_MM)
     assert sure.any()
     np.testing.assert_array_equal(after[sure], before[sure])
@@ -126,20 +125,6 @@ def test_an_estimator_with_it_measures_as_before_where_it_was_sure(network):
     along = [j[:, -1] - j[:, 0] for j in (true.reshape(toy.joints.shape), before, after)]
     flips = [np.mean(np.einsum("nd,nd->n", along[0], other) < 0) for other in along[1:]]
     assert flips[1] <= flips[0]
-
-
-def test_it_comes_out_of_the_model_file_as_it_went_in(network, tmp_path):
-    made = replace(trained("default").model, facing=network)
-    path = tmp_path / "told.npz"
-    path.write_bytes(made.to_bytes())
-    again = Model.load(path)
-    assert again.facing is not None
-    for one, other in zip(again.facing.layers, network.layers, strict=True):
-        for first, second in zip(one, other, strict=True):
-            np.testing.assert_array_equal(first, second)
-    assert again.to_bytes() == made.to_bytes()
-    path.write_bytes(replace(made, facing=None).to_bytes())
-    assert Model.load(path).facing is None
 
 
 def test_it_is_learned_again_with_the_same_bits(mice, network):

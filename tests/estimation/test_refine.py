@@ -76,9 +76,10 @@ def refined(
 
 
 def fit_of(
-    pose: Pose, heights: np.ndarray, crop_cameras: np.ndarray, moments: np.ndarray, size: float
+    pose: Pose, crops: HeightMaps, crop_cameras: np.ndarray, size: float = 1.0
 ) -> np.ndarray:
-    return REFINER.fit(alone(pose), heights, crop_cameras, moments, size)[:, 0]
+    images = ImageSet(crops.heights, crop_cameras, crops.moments)
+    return REFINER.fit(alone(pose), images, size)[:, 0]
 
 
 def off(a: Pose, b: Pose) -> np.ndarray:
@@ -140,17 +141,12 @@ def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> No
     )
     taken = off(best, near) < 1e-9
     assert taken.mean() > 0.9
-    np.testing.assert_allclose(
-        fit[taken], fit_of(near, crops.heights, crop_cameras, crops.moments, 1.0)[taken]
-    )
+    np.testing.assert_allclose(fit[taken], fit_of(near, crops, crop_cameras)[taken])
 
 
 def test_the_true_pose_explains_the_picture_best() -> None:
     crops, crop_cameras, true = hands()
-    fit, wrong = (
-        fit_of(pose, crops.heights, crop_cameras, crops.moments, 1.0)
-        for pose in (true, shaken(true, 3, 2.0))
-    )
+    fit, wrong = (fit_of(pose, crops, crop_cameras) for pose in (true, shaken(true, 3, 2.0)))
     worse = wrong[:, [0, 1, 4, 5]] > fit[:, [0, 1, 4, 5]]
     assert (worse.mean(axis=0) > 0.9).all()
 
@@ -158,7 +154,7 @@ def test_the_true_pose_explains_the_picture_best() -> None:
 def test_explanations_agree_with_the_slow_twin() -> None:
     crops, crop_cameras, true = hands()
     pose = shaken(true, 4)
-    fit, frames = fit_of(pose, crops.heights, crop_cameras, crops.moments, 1.07), pose.frames(HAND)
+    fit, frames = fit_of(pose, crops, crop_cameras, 1.07), pose.frames(HAND)
     for k in range(4):
         slow = explained(
             crops.heights[k],

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.catalog import find_model
 from liex_lab.estimation import _feature_kernels as kernels
@@ -20,12 +19,12 @@ from liex_lab.estimation.session_shape import (
     N_STATIONS,
     PLACES,
     Build,
-    CrossSections,
     ShapePrior,
+    built,
+    cross_sections,
     labels_of,
     session_clues,
 )
-from liex_lab.geometry import SE3
 from liex_lab.scene._height_map_kernels import CropCamera, to_pixel
 from liex_lab.scene.height_maps import view_of
 from tests.estimation.toy import SCENE, Toy, rendered, toy_mice
@@ -39,13 +38,14 @@ def toy() -> Toy:
     return toy_mice(60, 11, noise_mm=0.0, size=(1.0, 1.0))
 
 
-def across(toy: Toy, shape: BodyShape | None = None) -> CrossSections:
-    """The cross-sections of the toy's mice with a body, in their true poses."""
+def across(toy: Toy, shape: BodyShape | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Half widths (S,) and heights (S, T) of the toy's mice with a body, in their true poses."""
     crops = SCENE.extract(rendered(toy.skeleton, toy.pose, shape=shape), 1.0)
     cameras = SCENE.crop_cameras(crops, False)
     T_view_arena = view_of(cameras) @ SCENE.floor.T_arena_camera.inverse()
     pose = toy.pose.moved(T_view_arena)
-    return CrossSections.of(toy.skeleton, pose, crops.heights, cameras, 1.0)
+    covered, height, step = cross_sections(toy.skeleton, pose, crops.heights, cameras, 1.0)
+    return covered.sum(axis=1) * step, height
 
 
 def tall(toy: Toy, factor: float) -> BodyShape:
@@ -57,19 +57,19 @@ def tall(toy: Toy, factor: float) -> BodyShape:
 def test_the_half_width_of_the_cross_sections_is_that_of_the_body(toy):
     stations = np.array(toy.skeleton.surface["stations"])
     true = np.interp(AT, stations, BodyShape.default(toy.skeleton).half_width)
-    seen = across(toy).half_width * toy.skeleton.length
+    seen = across(toy)[0] * toy.skeleton.length
     np.testing.assert_allclose(seen[TRUNK], true[TRUNK], atol=1.2)  # a pixel is 2 mm
 
 
 def test_the_back_of_a_higher_body_lies_higher_and_falls_farther(toy):
-    flat, high = across(toy, tall(toy, 0.8)), across(toy, tall(toy, 1.2))
+    (_, flat), (_, high) = (across(toy, tall(toy, factor)) for factor in (0.8, 1.2))
     middle = slice(8, 14)
-    lies = (high.height - flat.height)[middle, 0] * toy.skeleton.length
+    lies = (high - flat)[middle, 0] * toy.skeleton.length
     usual = np.interp(
         AT[middle], toy.skeleton.surface["stations"], BodyShape.default(toy.skeleton).half_height
     )
     np.testing.assert_allclose(lies, 0.4 * usual, rtol=0.12)
-    falls = [one.height[middle, 0] - one.height[middle, 10] for one in (flat, high)]
+    falls = [one[middle, 0] - one[middle, 10] for one in (flat, high)]
     assert (falls[1] > 1.2 * falls[0]).all()
 
 
@@ -142,13 +142,8 @@ def test_poses_are_moved_in_their_own_frame_and_bones_keep_their_proportions(toy
 
 
 def test_frames_without_a_pose_stay_without_one(toy):
-    scale = toy.pose.scale.copy()
-    scale[3] = np.nan
-    pose = Pose(
-        SE3(toy.pose.root.rotation.copy(), toy.pose.root.translation.copy()),
-        toy.pose.angles.copy(),
-        scale,
-    )
+    pose = toy.pose[np.arange(5)]
+    pose.scale[3] = np.nan
     pose.root.translation[3] = np.nan
     moved = build(np.full((toy.skeleton.n_joints, 3), 0.01)).corrected(toy.skeleton, pose, 1.0)
     assert np.isnan(moved.joints(toy.skeleton)[3]).all()
@@ -156,7 +151,8 @@ def test_frames_without_a_pose_stay_without_one(toy):
 
 
 def test_the_body_of_a_build_is_as_much_wider_and_higher(toy):
-    body = build(np.zeros((toy.skeleton.n_joints, 3))).surface(toy.skeleton).shape
+    own = build(np.zeros((toy.skeleton.n_joints, 3)))
+    body = built(toy.skeleton, own.width, own.height).shape
     usual = BodyShape.default(toy.skeleton)
     assert body is not None
     np.testing.assert_allclose(body.half_width, usual.half_width)
@@ -185,7 +181,7 @@ def test_labels_come_back_as_a_build(toy):
         np.vstack([np.zeros((n, len(labels))), labels]),
         np.full(len(labels), 0.1),
     )
-    told = Build.from_clues(prior, clues)
+    told = Build.of(prior, prior.predict(clues))
     np.testing.assert_allclose(told.offset, offset, atol=1e-8)
     np.testing.assert_allclose(told.width, wide, rtol=1e-8)
     np.testing.assert_allclose(told.height, high, rtol=1e-8)

@@ -17,10 +17,10 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.body.surface import Surface, render_meshes
-from liex_lab.estimation.cascade import Candidates, ImageSet, Truth
+from liex_lab.estimation.cascade import Candidates, ImageSet, TrainingSet, Truth
 from liex_lab.estimation.method import METHODS, Method
 from liex_lab.estimation.model import ErrorCalibration, Model
-from liex_lab.estimation.training import TrainingSet, train_cascade, train_metric
+from liex_lab.estimation.training import train_cascade, train_metric
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera

@@ -9,7 +9,7 @@ import pytest
 
 from liex_lab.evaluation.scores import (
     Followed,
-    Individual,
+    MeasuredIndividual,
     PoseErrors,
     Tally,
     interval95,
@@ -186,11 +186,13 @@ def truth(x: float = 0.0, visible: float = 1.0) -> TrueAnimal:
     return TrueAnimal(SPINE, joints(x), np.full(M, visible))
 
 
-def one(x: float = 0.0, trusted: bool = True) -> Individual:
-    return Individual(joints(x), np.full(M, trusted))
+def one(x: float = 0.0, trusted: bool = True) -> MeasuredIndividual:
+    return MeasuredIndividual(joints(x), np.full(M, trusted))
 
 
-def scene(truths: list[TrueAnimal], individuals: list[Individual], fits: bool = True) -> dict:
+def scene(
+    truths: list[TrueAnimal], individuals: list[MeasuredIndividual], fits: bool = True
+) -> dict:
     tally = Tally()
     tally.add(truths, individuals, M, fits=fits)
     return tally.figures()
@@ -207,7 +209,7 @@ def test_a_right_pose_is_found_and_right():
         "trusted": 1.0,
         "wrong_but_trusted": 0.0,
     }
-    turned = Individual(joints()[:, ::-1].copy(), np.ones(M, np.bool_))
+    turned = MeasuredIndividual(joints()[:, ::-1].copy(), np.ones(M, np.bool_))
     assert scene([truth()], [turned])["flips"] == 1.0
 
 

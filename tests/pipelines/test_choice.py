@@ -22,7 +22,7 @@ from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.hand_segmenter import HandSegmenter
 from liex_lab.simulation.scenes.catalogue import film
-from liex_lab.tracking.residual import Agreement, SampleFit, count_animals
+from liex_lab.tracking.residual import BodyAgreement, SampleFit, count_animals
 
 GOOD = SampleFit(96, 96, 65.0, 2.0, 1.5, 0.8, 0.03)
 FISH = replace(GOOD, spine_mm=30.0, error_mm=1.0, residual_mm=0.7)
@@ -196,8 +196,8 @@ def test_the_best_of_several_is_the_one_with_the_least_error_for_its_length() ->
     assert best([]) is None
 
 
-def agreement(n: int, covered: float) -> Agreement:
-    return Agreement(np.full(n, 1.5), np.full(n, covered), np.full(n, 0.05), np.full(n, 3.0))
+def agreement(n: int, covered: float) -> BodyAgreement:
+    return BodyAgreement(np.full(n, 1.5), np.full(n, covered), np.full(n, 0.05), np.full(n, 3.0))
 
 
 def test_two_animals_are_two_where_the_second_fits_as_well_as_the_first() -> None:

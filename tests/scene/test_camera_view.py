@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.body.skeleton import CameraView
+from liex_lab.body.skeleton import CameraView, Skeleton
 from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.estimation.method import method_of
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene import _blob_kernels as blob_kernels
@@ -154,7 +155,11 @@ def test_an_animal_of_the_camera_view_starts_as_steep_as_its_back_both_ways(rise
     moments = scene("camera").extract(bar(rise)[None], 1.0, camera_view=True).moments
     starts = draw_starts(np.random.default_rng(1), 1, 8)
     rotation, position, _ = start_poses(
-        moments, starts, np.ones((1, 8)), 60.0, True, True, camera_view=True
+        moments,
+        starts,
+        np.ones((1, 8)),
+        Skeleton.load("fish"),
+        method_of("default", Skeleton.load("fish")),
     )
     forward = rotation[0, :, :, 0]
     slope = forward[:, 2] / np.hypot(forward[:, 0], forward[:, 1])

@@ -19,7 +19,7 @@ from liex_lab.sessions.rrd_scene import (
     log_surroundings,
 )
 from liex_lab.tables.rows import Rows
-from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.curve import track_whole
 from tests.tracking.stories import SUBJECT, lose, noisy, told, walk
 
 LEVEL = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 700.0, KINECT_V2)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from liex_lab.sessions.verdict import Verdict, read_verdict, verdict_in
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import track_whole
 from tests.tracking.stories import SUBJECT, lose, told, walk
 
 SECONDS = np.arange(200) / 30.0

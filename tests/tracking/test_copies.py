@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from liex_lab.recordings.frame import DepthFrame, marked
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import has_noise
-from liex_lab.tracking.offline import asked_too_often, copies_told, track_whole
+from liex_lab.tracking.curve import polled_twice, repeat_messages, track_whole
 from tests.recordings.writers import SMALL
 from tests.tracking.stories import SUBJECT, joint_error, noisy, told, walk
 
@@ -105,8 +105,8 @@ def test_asking_too_often_is_reported_with_the_cameras_own_rate(
     camera_hz: float, asked_hz: float, times: str
 ) -> None:
     times_ns, repeats = polled(camera_hz, asked_hz)
-    assert (asked_too_often(times_ns, repeats, ~repeats) == repeats).all()
-    assert copies_told(times_ns, repeats, noisy=True) == (
+    assert (polled_twice(times_ns, repeats, ~repeats) == repeats).all()
+    assert repeat_messages(times_ns, repeats, noisy=True) == (
         [],
         [
             f"each depth image is there {times}: the camera made {camera_hz}.00 frames/s, not "
@@ -121,11 +121,11 @@ def test_a_freeze_is_told_from_asking_too_often(n_frozen: int, at: int, twice: b
     frozen = slice(2 * at, min(2 * at + n_frozen, len(times_ns)))
     repeats = repeats.copy()
     repeats[frozen] = True
-    often = asked_too_often(times_ns, repeats, ~repeats)
+    often = polled_twice(times_ns, repeats, ~repeats)
     alone = ~often & repeats
     if n_frozen > 1 or not twice:
         assert alone[frozen].all()
-        reasons, cautions = copies_told(times_ns, repeats, noisy=True)
+        reasons, cautions = repeat_messages(times_ns, repeats, noisy=True)
         assert bool(reasons) == (alone.sum() > 24)
         assert any("the stream froze" in one for one in [*reasons, *cautions])
     assert not alone[: frozen.start - 1].any()
@@ -134,10 +134,10 @@ def test_a_freeze_is_told_from_asking_too_often(n_frozen: int, at: int, twice: b
 
 def test_without_noise_a_still_animal_is_noted_and_nothing_is_taken_from_it() -> None:
     times_ns, repeats = polled(30, 60)
-    reasons, cautions = copies_told(times_ns, repeats, noisy=False)
+    reasons, cautions = repeat_messages(times_ns, repeats, noisy=False)
     assert not reasons
     assert "the background has no noise" in cautions[0]
-    assert copies_told(times_ns[:9], repeats[:9], noisy=False) == ([], [])
+    assert repeat_messages(times_ns[:9], repeats[:9], noisy=False) == ([], [])
 
 
 def test_copies_do_not_make_a_track_surer_and_a_freeze_has_no_pose() -> None:

@@ -11,9 +11,7 @@ from liex_lab.pipelines.correct import place_joints
 from liex_lab.body.pose import Pose
 from liex_lab.geometry import SE3
 from liex_lab.sessions.corrections import JointMove
-from liex_lab.tracking.following import _smoothed, let_follow
-from liex_lab.tracking.motion_model import TrackingParameters
-from liex_lab.tracking.smoother import smooth
+from liex_lab.tracking.smoother import TrackingParameters, _smoothed, let_follow, smooth
 from liex_lab.tracking.track import Track
 from tests.sessions.walking_mouse import WalkingMouse, steady
 

@@ -7,10 +7,9 @@ import pytest
 
 from liex_lab.scene.height_maps import CROP, HeightMaps
 from liex_lab.tables.rows import Rows
+from liex_lab.tracking.curve import OnlineTracker, track_whole
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.occlusion import behind_something
-from liex_lab.tracking.offline import track_whole
-from liex_lab.tracking.online import OnlineTracker
 from liex_lab.tracking.track import Track
 from tests.tracking.stories import SUBJECT, lose, noisy, told, walk
 
@@ -38,26 +37,22 @@ def live_track(seen: Observations, lag: int) -> Track:
 
 
 def test_a_mouse_that_goes_under_a_roof_is_hidden_until_it_comes_back(seen: Observations) -> None:
+    """Of a mouse that is mostly behind something there is no trusted pose."""
     track = track_whole(SUBJECT, seen).track
     assert (track.flag[GONE] == "hidden").all()
     assert np.isnan(track.joints_mm[GONE]).all()
     assert (track.flag[:50] == "").all()
-    assert (track.flag[105:] == "").all()
-
-
-def test_of_a_mouse_that_is_mostly_behind_something_there_is_no_trusted_pose(
-    seen: Observations,
-) -> None:
-    track = track_whole(SUBJECT, seen).track
     assert (track.flag[52:55] == "doubtful").all()
     assert (track.flag[56:60] == "hidden").all()
+    assert (track.flag[105:] == "").all()
 
 
 def test_a_mouse_that_is_lost_in_the_open_is_not_found(seen: Observations) -> None:
     seen.behind[:] = 0.0
-    track = track_whole(SUBJECT, seen).track
-    assert not (track.flag == "hidden").any()
-    assert (track.flag[GONE] == "not_found").all()
+    for track in (track_whole(SUBJECT, seen).track, live_track(seen[40:120], 0)):
+        rows = np.flatnonzero(np.isin(track.times_ns, seen.times_ns[GONE]))
+        assert not (track.flag == "hidden").any()
+        assert (track.flag[rows] == "not_found").all()
 
 
 def test_observations_that_do_not_know_what_is_before_the_animal_are_as_before(
@@ -98,22 +93,15 @@ def test_the_live_track_says_hidden_as_the_whole_recording_does(
 
 
 def test_a_mouse_that_stays_under_a_roof_for_longer_than_the_live_window_stays_hidden() -> None:
-    seconds = np.arange(300) / 30.0
+    seconds = np.arange(110) / 30.0
     seen = told(seconds, noisy(walk(seconds), np.random.default_rng(3)))
     seen.behind[:] = 0.0
-    seen.n_px[55:60] = 500
-    seen.behind[55:60] = 0.1
-    lose(seen, slice(60, 290))
+    seen.n_px[15:20] = 500
+    seen.behind[15:20] = 0.1
+    lose(seen, slice(20, 100))
     live = live_track(seen, 0)
-    assert (live.flag[60:290] == "hidden").all()
-    assert (live.flag[292:] != "hidden").all()
-
-
-def test_a_mouse_that_is_lost_in_the_open_is_not_found_live_either(seen: Observations) -> None:
-    seen.behind[:] = 0.0
-    live = live_track(seen, 0)
-    assert not (live.flag == "hidden").any()
-    assert (live.flag[GONE] == "not_found").all()
+    assert (live.flag[20:100] == "hidden").all()
+    assert (live.flag[102:] != "hidden").all()
 
 
 def roofed(roof_mm: float) -> np.ndarray:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from liex_lab.tracking.association import cost_of_the_other
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations, joints_of
-from liex_lab.tracking.offline import track_whole
 from tests.tracking.stories import MOUSE, told, walk
 from tests.tracking.test_offline import SUBJECT
 
@@ -53,21 +53,13 @@ def test_what_costs_is_the_animal_that_most_frames_do_not_follow(sizes):
     assert (cost[JOINED] == 0.0).all()
 
 
-def test_animals_of_one_size_are_not_told_apart_by_it():
-    assert cost_of_the_other(meeting(800, 800), second_until(100)) is None
-
-
-def test_sizes_that_change_their_order_while_both_are_apart_tell_nothing():
-    seen = meeting(600, 800)
-    seen.n_px[::2] = seen.n_px[::2, [2, 3, 0, 1]]
-    assert cost_of_the_other(seen, second_until(100)) is None
-
-
-def test_few_frames_with_both_tell_nothing():
-    seen = meeting(600, 800)
+def test_sizes_that_are_equal_change_their_order_or_are_rarely_seen_tell_nothing():
+    changing, few = meeting(600, 800), meeting(600, 800)
+    changing.n_px[::2] = changing.n_px[::2, [2, 3, 0, 1]]
     for name in POSE:
-        getattr(seen, name)[11:, 2:] = np.nan
-    assert cost_of_the_other(seen, np.full(len(SECONDS), 2)) is None
+        getattr(few, name)[11:, 2:] = np.nan
+    for seen in (meeting(800, 800), changing, few):
+        assert cost_of_the_other(seen, second_until(100)) is None
 
 
 @pytest.mark.parametrize("sizes", [(800, 640), (640, 800), (720, 720)])

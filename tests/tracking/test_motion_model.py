@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.tracking.motion_model import TrackingParameters
+from liex_lab.tracking.smoother import TrackingParameters
 
 
 @pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])

@@ -15,10 +15,9 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import on_disk
+from liex_lab.tracking.curve import OnlineTracker, track_whole
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
-from liex_lab.tracking.offline import track_whole
-from liex_lab.tracking.online import OnlineTracker
-from liex_lab.tracking.smoother import Curve
+from liex_lab.tracking.smoother import SmoothedCurve
 from liex_lab.tracking.track import Flip, Track, ends_of, short_gaps, spans, whole_gaps
 from liex_lab.tracking.track_rows import covariance_of_root, single_frames
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
@@ -71,7 +70,9 @@ def test_the_roots_covariance_is_that_of_a_middle_that_is_off_and_a_turn_about_i
         np.array([[0.04, 0.02, 0.06]]),
     )
     one = np.ones(1)
-    said = covariance_of_root(Curve(pose, joints, one, middle[None], sd_turn, sd_turn, one > 0))[0]
+    said = covariance_of_root(
+        SmoothedCurve(pose, joints, one, middle[None], sd_turn, sd_turn, one > 0)
+    )[0]
     centre, turns = joints[0].mean(axis=0), sd_turn * rng.normal(size=(n, 3))
     turned = pose.root.rotation[0] @ so3.exp(turns)
     lever = pose.root.rotation[0].T @ (pose.root.translation[0] - centre)
@@ -268,8 +269,8 @@ def test_a_recording_without_any_animal_is_empty_rows():
 def test_a_long_recording_is_smoothed_in_blocks_that_nobody_sees(measured, monkeypatch):
     seen = told(SECONDS, measured)
     whole = track_whole(SUBJECT, seen).track
-    monkeypatch.setattr("liex_lab.tracking.offline._BLOCK", 40)
-    monkeypatch.setattr("liex_lab.tracking.offline.MARGIN", 60)
+    monkeypatch.setattr("liex_lab.tracking.curve._BLOCK", 40)
+    monkeypatch.setattr("liex_lab.tracking.curve.MARGIN", 60)
     parts = track_whole(SUBJECT, seen).track
     np.testing.assert_allclose(parts.joints_mm, whole.joints_mm, atol=0.02)
 
@@ -277,7 +278,7 @@ def test_a_long_recording_is_smoothed_in_blocks_that_nobody_sees(measured, monke
 def test_a_track_on_disk_is_the_one_in_memory(measured, tmp_path, monkeypatch):
     seen = told(SECONDS, measured)
     lose(seen, slice(50, 58))
-    monkeypatch.setattr("liex_lab.tracking.offline._BLOCK", 40)
+    monkeypatch.setattr("liex_lab.tracking.curve._BLOCK", 40)
     monkeypatch.setattr("liex_lab.tracking.association._BLOCK", 30)
     flip = Flip(20, 30, 1.0, True, "human")
     here, there = (

@@ -130,21 +130,18 @@ def test_a_build_that_is_told_a_little_too_stout_is_held_at_its_best_girth(
     assert shape.residual_mm < shape.average_residual_mm
 
 
-def test_too_few_good_frames_leave_the_average_body_and_say_so(toy, estimator, estimates):
+def test_the_average_body_is_left_where_a_shape_cannot_be_fitted(toy, estimator, estimates):
+    """Too few good frames, shapes learned for another model, or none at all."""
     prior = certain(toy, estimator, LIFTED, HIGHER)
-    seen = np.arange(N) < FEWEST_FRAMES - 1
-    shape, _ = fitted(toy, estimator, replace(estimates, found=seen), prior)
-    assert shape is not None
-    assert shape.build is None
-    assert shape.why.startswith("49 frames")
-
-
-def test_shapes_learned_for_another_model_are_not_used(toy, estimator, estimates):
-    prior = replace(certain(toy, estimator, LIFTED, HIGHER), model="another")
-    shape, _ = fitted(toy, estimator, estimates, prior)
-    assert shape is not None
-    assert shape.build is None
-    assert "model" in shape.why
+    few = replace(estimates, found=np.arange(N) < FEWEST_FRAMES - 1)
+    for own, sample, why in (
+        (prior, few, "49 frames"),
+        (replace(prior, model="another"), estimates, "model"),
+    ):
+        shape, _ = fitted(toy, estimator, sample, own)
+        assert shape is not None
+        assert shape.build is None
+        assert why in shape.why
     assert fitted(toy, estimator, estimates, None)[0] is None
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from liex_lab.tracking.own_shape import Found, agree, spread_of
+from liex_lab.tracking.own_shape import SessionBody, agree, spread_of
 
 FOUND = st.builds(
-    Found,
+    SessionBody,
     spine_mm=st.floats(76.0, 82.0),
     stated=st.just(False),
     log_sd=st.floats(0.0, 0.1),
@@ -21,7 +20,7 @@ FOUND = st.builds(
     girth=st.floats(0.75, 1.35),
     shape=st.none() | st.lists(st.floats(-0.5, 0.5), min_size=13, max_size=13).map(np.array),
     refused=st.just(False),
-    n_well_seen=st.integers(50, 100),
+    n_good_frames=st.integers(50, 100),
 )
 
 
@@ -66,35 +65,37 @@ def test_the_length_is_the_random_effects_mean(found):
     assert agree(found).spine_mm == pytest.approx(wanted, rel=1e-9)
 
 
-def length_of(*found: Found) -> float:
+def length_of(*found: SessionBody) -> float:
     length = agree(found).spine_mm
     assert length is not None
     return length
 
 
-def shape_of(*found: Found) -> np.ndarray:
+def shape_of(*found: SessionBody) -> np.ndarray:
     shape = agree(found).shape
     assert shape is not None
     return shape
 
 
-def test_sessions_that_agree_within_their_scatter_count_by_their_frames():
-    few, many = Found(80.0, log_sd=0.1, n_frames=10), Found(81.0, log_sd=0.1, n_frames=90)
-    assert math.log(length_of(few, many)) == pytest.approx(
-        0.1 * math.log(80.0) + 0.9 * math.log(81.0)
-    )
-
-
-def test_where_sessions_differ_more_than_their_frames_each_counts_about_as_much():
+@pytest.mark.parametrize(
+    ("lengths", "log_sd", "frames", "shares"),
+    [((80.0, 81.0), 0.1, (10, 90), (0.1, 0.9)), ((78.0, 82.0), 0.01, (10, 100), (0.5, 0.5))],
+)
+def test_sessions_count_by_their_frames_unless_they_differ_by_more_than_their_scatter(
+    lengths, log_sd, frames, shares
+):
     """Ten times the frames make a session no better witness of what differs between sessions."""
-    few, many = Found(78.0, log_sd=0.01, n_frames=10), Found(82.0, log_sd=0.01, n_frames=100)
-    assert length_of(few, many) == pytest.approx(math.sqrt(78.0 * 82.0), rel=1e-4)
+    few, many = (
+        SessionBody(mm, log_sd=log_sd, n_frames=n) for mm, n in zip(lengths, frames, strict=True)
+    )
+    wanted = np.exp(np.dot(shares, np.log(lengths)))
+    assert length_of(few, many) == pytest.approx(wanted, rel=1e-4)
 
 
 def test_a_length_that_is_stated_is_no_finding_and_the_shape_is_shared_all_the_same():
     shape = np.full(13, 0.2)
-    stated = Found(80.0, stated=True, shape=shape, n_well_seen=60)
-    measured = Found(82.0, shape=shape, n_well_seen=60)
+    stated = SessionBody(80.0, stated=True, shape=shape, n_good_frames=60)
+    measured = SessionBody(82.0, shape=shape, n_good_frames=60)
     assert length_of(stated, measured) == pytest.approx(82.0)
     assert agree([stated, stated]).spine_mm is None
     np.testing.assert_allclose(shape_of(stated, stated), shape)
@@ -104,20 +105,20 @@ def test_a_length_that_is_stated_is_no_finding_and_the_shape_is_shared_all_the_s
 def test_a_shape_is_shared_where_more_frames_speak_for_one_than_against(
     n_for, n_against, is_shared
 ):
-    own = Found(80.0, shape=np.full(13, 0.1), n_well_seen=n_for)
-    average = Found(80.0, girth=1.2, refused=True, n_well_seen=n_against)
-    unsure = Found(80.0, girth=1.2, n_well_seen=500)  # too few frames for a shape: no voice
+    own = SessionBody(80.0, shape=np.full(13, 0.1), n_good_frames=n_for)
+    average = SessionBody(80.0, girth=1.2, refused=True, n_good_frames=n_against)
+    unsure = SessionBody(80.0, girth=1.2, n_good_frames=500)  # too few frames for a shape: no voice
     agreed = agree([own, average, unsure])
     assert (agreed.shape is not None) == is_shared
     assert agreed.girth == (None if is_shared else pytest.approx(1.2))
 
 
 def test_shapes_count_by_the_frames_that_show_the_animal_well():
-    one = Found(80.0, shape=np.full(13, 0.1), n_well_seen=50)
-    other = replace(one, shape=np.full(13, 0.4), n_well_seen=100)
+    one = SessionBody(80.0, shape=np.full(13, 0.1), n_good_frames=50)
+    other = replace(one, shape=np.full(13, 0.4), n_good_frames=100)
     np.testing.assert_allclose(shape_of(one, other), 0.3)
 
 
 def test_the_spread_is_that_of_the_farthest_over_the_median():
-    found = [Found(mm) for mm in (79.0, 80.0, 86.0)]
+    found = [SessionBody(mm) for mm in (79.0, 80.0, 86.0)]
     assert spread_of(found) == pytest.approx(7.0 / 80.0)

@@ -14,6 +14,7 @@ from liex_lab.recordings.frame import DepthFrame
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.tracking.own_shape import StatedShape
 from liex_lab.tracking.track import Track
+from liex_lab.tracking.track_rows import single_frames
 from liex_lab.tracking.tracker import FrameTracker
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice, trained
 
@@ -46,9 +47,13 @@ def tracker(toy: Toy, scene: BackgroundSubtraction) -> FrameTracker:
     return FrameTracker.prepare(PoseEstimator(trained("default").model), scene, toy.depths)
 
 
+def followed(tracker: FrameTracker, frames: list[DepthFrame]) -> Track:
+    return single_frames(tracker.subject, tracker.observe(frames))
+
+
 @pytest.fixture(scope="module")
 def track(tracker: FrameTracker, frames: list[DepthFrame]) -> Track:
-    return tracker.follow(frames)
+    return followed(tracker, frames)
 
 
 def test_every_frame_has_a_row_and_the_empty_ones_say_why(track, frames):
@@ -109,7 +114,7 @@ def test_the_true_body_is_not_far_from_the_observed_surface(track, tracker):
 def test_rows_do_not_depend_on_how_the_frames_are_dealt_out(tracker, frames, track):
     for size in (1, 7):
         joined = Track.join(
-            [tracker.follow(frames[start : start + size]) for start in range(0, len(frames), size)]
+            [followed(tracker, frames[k : k + size]) for k in range(0, len(frames), size)]
         )
         for field in fields(Track):
             if field.name != "skeleton":
@@ -152,7 +157,7 @@ def test_the_size_is_measured_or_taken_from_the_plan(tracker, toy, scene):
 def test_a_frame_is_doubtful_where_more_error_is_expected_than_allowed(toy, scene, frames, track):
     estimator = PoseEstimator(trained("default").model)
     limit = float(np.nanmedian(track.predicted_error_mm))
-    strict = FrameTracker.prepare(estimator, scene, toy.depths, doubtful_mm=limit).follow(frames)
+    strict = followed(FrameTracker.prepare(estimator, scene, toy.depths, doubtful_mm=limit), frames)
     seen = strict.observed
     np.testing.assert_array_equal(
         strict.flag[seen] == "doubtful", strict.predicted_error_mm[seen] > limit

@@ -9,15 +9,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.offline import track_whole
 from liex_lab.tracking.trust import (
     contradicted,
     elsewhere,
+    head_tail_weight,
     lies_unknown,
     share_in_view,
     together,
-    told_ends,
     usual_pixels,
 )
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
@@ -80,18 +80,18 @@ def test_a_pose_either_way_round_is_where_the_animal_is(seen: Observations) -> N
     error = np.full(120, 2.0)
     for h in (0, 1):
         joints = seen.pose(np.full(120, h)).joints(MOUSE)
-        assert not elsewhere(MOUSE, seen, joints, error, MOUSE.length, 800).any()
+        assert not elsewhere(seen, joints, error, MOUSE.length, 800).any()
     across = seen.pose(FIRST).joints(MOUSE)
     middle = across.mean(axis=1, keepdims=True)
     across = middle + (across - middle) @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-    assert elsewhere(MOUSE, seen, across, error, MOUSE.length, 800).mean() > 0.9
+    assert elsewhere(seen, across, error, MOUSE.length, 800).mean() > 0.9
 
 
 def test_of_an_animal_that_is_hardly_seen_nothing_is_said(seen: Observations) -> None:
     far = seen.pose(FIRST).joints(MOUSE) + 200.0
-    assert elsewhere(MOUSE, seen, far, np.full(120, 2.0), MOUSE.length, 800).all()
+    assert elsewhere(seen, far, np.full(120, 2.0), MOUSE.length, 800).all()
     seen.n_px[:] = 200
-    assert not elsewhere(MOUSE, seen, far, np.full(120, 2.0), MOUSE.length, 800).any()
+    assert not elsewhere(seen, far, np.full(120, 2.0), MOUSE.length, 800).any()
 
 
 def test_a_gap_is_not_bridged_elsewhere_while_the_animal_is_in_view(seen: Observations) -> None:
@@ -159,7 +159,7 @@ def test_the_ends_of_an_animal_beside_a_bar_are_told_by_the_frames_around(
     truth = walk(SECONDS)
     turned = track_whole(SUBJECT, seen).track
     seen.behind[behind, :2] = 0.2
-    ends = told_ends(seen)
+    ends = head_tail_weight(seen)
     assert np.all(ends[behind, :2] < 0.05)
     assert np.all(ends[:45] == 1.0)
     track = track_whole(SUBJECT, seen).track

@@ -23,8 +23,8 @@ from liex_lab.pipelines.evaluation.paper.rows import Sweep, chosen_values, with_
 from liex_lab.pipelines.evaluation.paper.run import PARTS, Budget, keep_results, kept_results
 from liex_lab.pipelines.training.pose_model import recipe_of, training_of
 
+from liex_lab.baselines.baseline import ForestPlan, train_forests
 from liex_lab.baselines.cnn import CnnPlan
-from liex_lab.baselines.forest import ForestPlan, train_forests
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import kept_results_folder
 from liex_lab.errors import LiexError, MissingPackageError, PlanError

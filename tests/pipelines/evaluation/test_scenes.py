@@ -13,7 +13,7 @@ from liex_lab.pipelines.evaluation import scenes
 from liex_lab.pipelines.evaluation.scenes import cases, evaluate_scenes
 
 from liex_lab.errors import EstimationError, LiexError
-from liex_lab.evaluation.scores import Individual
+from liex_lab.evaluation.scores import MeasuredIndividual
 from liex_lab.simulation.scenes.catalogue import SEALED_FROM
 
 
@@ -42,7 +42,7 @@ def test_each_row_stands_beside_the_plain_scene_of_the_same_animal(monkeypatch):
     def pretend(recording, plan):
         off = 3.0 if recording.scene == "plain" else 6.0
         joints = recording.animals[0].joints_camera + np.array([off, 0.0, 0.0])
-        return [Individual(joints, np.ones(len(joints), np.bool_))], [], 0
+        return [MeasuredIndividual(joints, np.ones(len(joints), np.bool_))], [], 0
 
     monkeypatch.setattr(scenes, "run_product", pretend)
     told = []

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from functools import partial
 from itertools import pairwise
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -70,16 +71,16 @@ def test_whether_the_paper_s_gain_is_seen_follows_from_the_numbers():
     assert "is not reproduced" in comparison(lost, "mouse")
 
 
-def test_noise_that_nobody_searched_is_not_said_to_be_searched(monkeypatch):
+def test_noise_that_nobody_searched_is_not_said_to_be_searched():
     rows = {row: {"mean_joint_error_mm": 4.0, "ratio_to_single": 1.0} for row in PAPER_ROWS}
     found = {("mouse", "paper", n): ProcessNoise(sigma_mm=3.0) for n in (0, 1)}
     for known in ({}, dict(list(found.items())[:1])):
-        monkeypatch.setattr(particles, "_SEARCHED", known)
-        assert "set by hand and was not searched" in comparison(rows, "mouse")
-    monkeypatch.setattr(particles, "_SEARCHED", found)
-    assert "was searched on other sequences" in comparison(rows, "mouse")
-    assert ProcessNoise.of("mouse", "paper", 1) == ProcessNoise(sigma_mm=3.0)
-    assert "set by hand" in comparison(rows, "fish")
+        with patch.dict(particles.SEARCHED, known, clear=True):
+            assert "set by hand and was not searched" in comparison(rows, "mouse")
+    with patch.dict(particles.SEARCHED, found, clear=True):
+        assert "was searched on other sequences" in comparison(rows, "mouse")
+        assert ProcessNoise.of("mouse", "paper", 1) == ProcessNoise(sigma_mm=3.0)
+        assert "set by hand" in comparison(rows, "fish")
 
 
 def test_the_noise_is_searched_downhill_and_no_setting_is_tried_twice():

@@ -24,8 +24,8 @@ from liex_lab.pipelines.training.motion_model import (
 
 from liex_lab.geometry import so3
 from liex_lab.simulation.corruptions import Event
-from liex_lab.tracking.motion_model import TrackingParameters
-from liex_lab.tracking.offline import track_whole
+from liex_lab.tracking.curve import track_whole
+from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Track
 from tests.tracking.stories import MOUSE, SUBJECT, noisy, told, walk
 
