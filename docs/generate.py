@@ -259,9 +259,10 @@ def python_interface() -> str:
             if path in MODULES:
                 module = import_module(path)
                 lines += [*_docstring(module), ""]
-                for inner, one in vars(module).items():
-                    own = getattr(one, "__module__", "") == path and not inner.startswith("_")
-                    if own and (inspect.isclass(one) or members == "*"):
+                for inner in getattr(module, "__all__", vars(module)):
+                    one = getattr(module, inner)
+                    own = hasattr(module, "__all__") or getattr(one, "__module__", "") == path
+                    if own and inner[0] != "_" and (inspect.isclass(one) or members == "*"):
                         lines += _described(f"{path}.{inner}", one)
             else:
                 one = getattr(import_module(home), name)

@@ -25,7 +25,7 @@ ignore_outdated_kernels()
 # idle kernel threads sleep; OpenMP's default threads spin, on cores on which
 # recordings are read and logs are written (libgomp reads this when it is loaded)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-_KERNELS_TOLD = keep_kernels()  # a message for the command line, or an empty text
+_KERNELS_NOTICE = keep_kernels()  # a message for the command line, or an empty text
 
 _HOMES = {
     "Camera": "liex_lab.optics.camera",

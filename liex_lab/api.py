@@ -1,449 +1,70 @@
 """Public Python interface: the CLI commands as Python functions.
 
-`run_session` is `liex run`, `run_demo` is `liex demo`, and so on. The packages `pipelines` (jobs)
-and `dashboards` (views) do not import each other; this module passes the views (the layout of the
-Rerun replay and the HTML report) to the job that writes a session. Jobs are imported on first use.
+`run_session` is `liex run`, `run_demo` is `liex demo`, and so on. Jobs are imported on first use.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import MissingPackageError, how_to_install
-from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
-from liex_lab.runtime.memory import check_limits
-from liex_lab.runtime.progress import Board, Progress, progress_board, silent, telling_of_compiling
-from liex_lab.runtime.threads import imported_ahead
+from liex_lab.runtime.progress import Board, Progress, progress_board, silent
 
 if TYPE_CHECKING:
-    from liex_lab.pipelines.arenas import ArenaOutcome
+    from liex_lab.pipelines.arenas import run_arenas
+    from liex_lab.pipelines.compare import compare_groups
+    from liex_lab.pipelines.correct import correct_session, describe_session
+    from liex_lab.pipelines.drawing import draw_figures, export_video
+    from liex_lab.pipelines.live import follow_live
+    from liex_lab.pipelines.session import run_demo, run_session
     from liex_lab.pipelines.study.status import SessionStatus
-    from liex_lab.pipelines.verify import Finding
-    from liex_lab.pipelines.workers import WorkerPool
-    from liex_lab.recordings.recording import Recording
+    from liex_lab.pipelines.verify import verify_session
     from liex_lab.sessions.corrections import Correction
 
-DEMO = "mouse_walk.mcap"
-# modules that take seconds to import and are needed only after the first frames: for the replay,
-# the table `transitions` and the figures
-_HEAVY = (
-    "pandas",
-    "rerun",
-    "scipy.special",
-    "matplotlib.figure",
-    "matplotlib.backends.backend_pdf",
-)
+_JOBS = {  # function: the module of `pipelines` that defines it
+    "run_session": "session",
+    "run_arenas": "arenas",
+    "compare_groups": "compare",
+    "correct_session": "correct",
+    "describe_session": "correct",
+    "draw_figures": "drawing",
+    "export_video": "drawing",
+    "follow_live": "live",
+    "run_demo": "session",
+    "verify_session": "verify",
+}
+
+__all__ = [  # noqa: RUF022 - in the order of the manual
+    "run_session",
+    "run_arenas",
+    "correct_session",
+    "describe_session",
+    "follow_live",
+    "run_demo",
+    "draw_figures",
+    "compare_groups",
+    "export_video",
+    "run_study",
+    "serve_dashboard",
+    "verify_session",
+    "write_long",
+    "run_scale",
+    "evaluate_tracking",
+    "evaluate_scenes",
+    "evaluate_actions",
+    "run_tables",
+]
 
 
-def run_session(
-    recording: str | Path | Recording,
-    plan: Plan | None = None,
-    out: str | Path = ".",
-    *,
-    settings: Sequence[str] = (),
-    folder: Path | None = None,
-    overwrite: bool = False,
-    notes: Mapping[str, Any] | None = None,
-    workers: int = 1,
-    pool: WorkerPool | None = None,
-    progress: Progress = silent,
-) -> Path:
-    """Measure every frame of a depth recording and write a session folder; returns its path.
-
-    The steps are background subtraction, single-frame pose estimation by the Lie-X method,
-    association and smoothing over the whole recording, kinematics and ethogram. If the recording,
-    the plan or the animal cannot be used, no partial output remains.
-
-    Args:
-        recording: path of a recording, address of a virtual one, or an open recording.
-        plan: all settings of the run; None selects the bundled plan that fits, the mouse's if it
-            does.
-        out: parent of the session folder `<recording's name>.liex`.
-        settings: overrides when no plan is given, texts like 'animal.spine_mm=65'.
-        folder: the session folder, to use another name.
-        overwrite: replace an existing session.
-        notes: additional facts for session.json, see `SessionWriter.note`.
-        workers: processes for parallel shards of a long recording; 0 uses one for every two cores,
-            four at most, for more than 6,000 frames. The tables are the same for any number.
-            Scripts that use more than one must guard their entry point with `if __name__ ==
-            "__main__":`, as processes are spawned.
-        pool: a worker pool to use instead of `workers` local processes.
-        progress: receives progress reports.
-
-    Returns:
-        The session folder.
-
-    Raises:
-        LiexError: the recording, the plan or the animal in it cannot be used; the message gives
-            advice.
-    """
-    from liex_lab.pipelines.session import measure_session
-    from liex_lab.pipelines.workers import processes_for
-
-    check_limits()
-    with imported_ahead(*_HEAVY), telling_of_compiling(progress) as progress:
-        return measure_session(
-            recording,
-            plan,
-            out,
-            settings=settings,
-            folder=folder,
-            overwrite=overwrite,
-            notes=notes,
-            blueprint=_layout,
-            report=_views,
-            pool=pool or processes_for(workers),
-            progress=progress,
-        )
-
-
-def run_arenas(
-    recording: str | Path | Recording,
-    plan: Plan | None = None,
-    out: str | Path = ".",
-    *,
-    settings: Sequence[str] = (),
-    overwrite: bool = False,
-    notes: Mapping[str, Any] | None = None,
-    workers: int = 1,
-    pool: WorkerPool | None = None,
-    progress: Progress = silent,
-) -> list[ArenaOutcome]:
-    """Measure several arenas in one image, each as a separate session, in one pass.
-
-    Args:
-        recording: path of a recording, address of a virtual one, or an open recording.
-        plan: lists `[[arenas]]`, or has `arenas = "auto"`; None selects the bundled plan that fits
-            each arena, with the arenas in `settings`.
-        out: parent of the session folders `<recording's name>-<arena>.liex`.
-        settings: overrides when no plan is given.
-        overwrite: replace existing sessions.
-        notes: additional facts for every session.json.
-        workers: processes for parallel shards of a long recording, one arena at a time; 0 or 1
-            measures all arenas in one pass.
-        pool: a worker pool to use instead.
-        progress: receives progress reports.
-
-    Returns:
-        For each arena its session folder, or the reason why it could not be measured.
-
-    Raises:
-        LiexError: the recording or the plan cannot be used, or arenas overlap.
-    """
-    from liex_lab.pipelines.arenas import measure_arenas
-    from liex_lab.pipelines.workers import processes_for
-
-    with imported_ahead(*_HEAVY), telling_of_compiling(progress) as progress:
-        return measure_arenas(
-            recording,
-            plan,
-            out,
-            settings=settings,
-            overwrite=overwrite,
-            notes=notes,
-            blueprint=_layout,
-            report=_views,
-            pool=pool or processes_for(workers or 1),
-            progress=progress,
-        )
-
-
-def correct_session(
-    session: str | Path,
-    what: Sequence[Correction] = (),
-    *,
-    undo: Sequence[int] = (),
-    author: str = "",
-    report: bool = True,
-    progress: Progress = silent,
-) -> Path:
-    """Add corrections to a session, or undo some by number; updates tables and report.
-
-    The measured data are unchanged; see `liex_lab.sessions.corrections`. Without `what` and `undo`,
-    everything derived from the corrections is regenerated.
-
-    Args:
-        session: the session folder.
-        what: corrections made by the functions of `liex_lab.sessions.correcting`.
-        undo: numbers of corrections to undo.
-        author: author of the corrections; "" uses the current account.
-        report: whether to regenerate report and figures; for a series of corrections, the last call
-            is enough.
-        progress: receives progress reports.
-
-    Returns:
-        The session folder.
-
-    Raises:
-        SessionError: a correction cannot be applied, or another program is correcting the session.
-    """
-    from liex_lab.pipelines.correct import correct_session as job
-
-    return job(
-        session,
-        what,
-        undo=undo,
-        author=author,
-        blueprint=_layout,
-        report=_views if report else None,
-        progress=progress,
-    )
-
-
-def follow_live(
-    source: str,
-    plan: Plan,
-    *,
-    replay: bool = False,
-    to: str = "viewer",
-    patience_s: float = 3.0,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Show the skeletons of an ongoing recording in a Rerun viewer; returns measured latencies.
-
-    Args:
-        source: a file or folder that is being written, HOST:PORT of a sender, or, with `replay`, a
-            recording.
-        plan: all settings of the run.
-        replay: play back a finished recording at its own pace, as if it were live.
-        to: 'viewer' starts a viewer on this machine; else a viewer's address, or an .rrd file.
-        patience_s: time without growth after which a file counts as finished, s.
-        progress: receives the number of processed frames.
-
-    Returns:
-        Numbers: name, n_frames, n_live (frames whose latency was measured), latency_median_ms and
-            latency_p95_ms (None if absent), n_measured, n_bridged.
-
-    Raises:
-        LiexError: the source ends before its first frame, cannot be read, or there is no screen for
-            a viewer.
-    """
-    from liex_lab.dashboards.replay.layouts import live_blueprint
-    from liex_lab.pipelines.live import follow_live as job
-    from liex_lab.pipelines.live import open_live
-    from liex_lab.sessions.viewer import LiveView, need_screen
-
-    if to == "viewer":  # fail early, before a wait of minutes
-        need_screen("write a file with --to NAME.rrd, which any viewer opens")
-    arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
-    numbers, _ = job(
-        arriving,
-        plan,
-        progress=progress,
-        viewer=lambda tracker, arriving: LiveView(
-            arriving.name,
-            arriving.camera,
-            tracker.subject.T_arena_camera,
-            tracker.subject.skeleton,
-            to,
-            live_blueprint(tracker.subject.length_mm / 1000.0),
-        ),
-    )
-    return numbers
-
-
-def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
-    """Measure the bundled sample recording; returns its session folder.
-
-    An earlier demo session in the same folder is replaced.
-
-    Args:
-        out: parent of the session folder.
-        progress: receives progress reports.
-    """
-    from liex_lab.catalog import find_sample
-
-    return run_session(
-        find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress
-    )
-
-
-def draw_figures(
-    place: str | Path,
-    *,
-    only: Sequence[str] = (),
-    formats: Sequence[str] = ("svg", "pdf"),
-    out: str | Path | None = None,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Draw the figures of a session, a study or a comparison as files.
-
-    Figures are one or two journal columns wide, texts are editable, and the same tables give the
-    same bytes.
-
-    Args:
-        place: a session folder; a study file, its folder, or a folder that contains sessions; or
-            the folder of a comparison.
-        only: names of figures, such as 'occupancy', or measures of a comparison; () draws all.
-        formats: some of svg, pdf and png; 'pages' is a single file figures.pdf with all figures.
-        out: the output folder; None uses `figures` next to the data.
-        progress: receives the name of each figure.
-
-    Returns:
-        `files`: the paths; `empty`: names of figures without data; `folder`.
-
-    Raises:
-        SessionError: there is no such figure or format, or no data to draw.
-        StudyError: there is no such session, study or comparison.
-    """
-    from liex_lab.dashboards.figures import sets
-    from liex_lab.errors import SessionError
-    from liex_lab.pipelines.study.run import list_sessions
-    from liex_lab.sessions import Session
-
-    path = Path(place)
-    folder = path if path.is_dir() else path.parent
-    sets.check_kinds(formats)
-    if (path / "session.json").is_file():
-        sets.check_names(only, list(sets.OF_SESSION))
-        drawn = sets.session_figures(Session.open(path), only)
-    elif (path / sets.COMPARISON_FILE).is_file():
-        table, stats, sessions = sets.read_comparison(path)
-        measures = [str(name) for name in dict.fromkeys(stats["measure"])]
-        sets.check_names(only, ["effects", *measures, *sets.OF_STUDY])
-        drawn = sets.comparison_figures(table, stats, sessions, only)
-        sets.remove_others(path / sets.FOLDER, measures)
-    else:
-        sets.check_names(only, list(sets.OF_STUDY))
-        _, look = list_sessions(path)
-        folders = [entry.folder for entry in look() if entry.folder is not None]
-        if not folders:
-            raise SessionError(
-                f"no session of {path} has been measured; `liex cohort` measures them"
-            )
-        drawn = sets.study_figures([Session.open(one) for one in folders], only)
-    target = folder / sets.FOLDER if out is None else Path(out)
-    files, empty = sets.write_figures(drawn, target, formats, progress)
-    if not files:
-        raise SessionError(
-            f"{path} holds nothing to draw of {', '.join(empty)}: no pose was found, or too few "
-            "actions; its report says why"
-        )
-    return {"files": files, "empty": empty, "folder": target}
-
-
-def compare_groups(
-    places: Sequence[str | Path],
-    out: str | Path,
-    measures: Sequence[str] = (),
-    *,
-    reference: str | None = None,
-    animals: str | Path | None = None,
-    engine: str = "auto",
-    only_trusted: bool = False,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Compare groups of sessions; writes tables, a methods text, and figures.
-
-    Args:
-        places: study files, session folders, or folders that contain sessions at any depth.
-        out: output folder; created if needed.
-        measures: columns of the summary; () uses the default ones and every action's share.
-        reference: compare with this group only; None compares all pairs.
-        animals: a CSV with `subject_id` and any of group, cage, sex, batch; it overrides the
-            sessions' own facts.
-        engine: `auto`, `permutation` or `mixed`.
-        only_trusted: exclude sessions that need review.
-        progress: receives progress by session and figure.
-
-    Returns:
-        `stats`: the table's rows; `folder`: the output folder; `figures`: their paths; `sessions`:
-            a sentence that accounts for every session; `check`: warnings.
-
-    Raises:
-        SessionError: there are no two groups, or a folder, column, engine or CSV cannot be used.
-    """
-    from liex_lab.pipelines.compare import compare_sessions
-
-    found = compare_sessions(
-        places,
-        out,
-        measures,
-        reference=reference,
-        animals=animals,
-        engine=engine,
-        only_trusted=only_trusted,
-        progress=progress,
-    )
-    return {**found, "figures": draw_figures(found["folder"], progress=progress)["files"]}
-
-
-def export_video(
-    places: str | Path | Sequence[str | Path],
-    out: str | Path | None = None,
-    *,
-    actions: Sequence[str] = (),
-    groups: Sequence[str] = (),
-    start_s: float | None = None,
-    stop_s: float | None = None,
-    slower: float = 1.0,
-    overwrite: bool = False,
-    progress: Progress = silent,
-) -> Path:
-    """Write a video (H.264): height above the floor, skeleton, trail, action and time.
-
-    One session is shown from beginning to end, on its own clock; several are shown side by side, by
-    group. With `actions`, the video contains clips of these bouts, aligned at the onsets; a
-    session's report links to the videos in its folder.
-
-    Args:
-        places: a session folder, several, or folders that contain sessions at any depth.
-        out: the output folder; None uses the session's own, or the current folder for several.
-        actions: actions, or prefixes of them: rear includes rear_supported and rear_unsupported.
-        groups: only sessions of these groups; () includes all.
-        start_s: start of a stretch of one session, s.
-        stop_s: end of that stretch, s.
-        slower: slow-motion factor.
-        overwrite: replace an existing file.
-        progress: receives progress reports.
-
-    Returns:
-        Path of the video.
-
-    Raises:
-        SessionError: a session has no depth, no bout has such a name, this PyAV has no encoder, or
-            the file exists.
-    """
-    from liex_lab.dashboards.report.report import write_report
-    from liex_lab.dashboards.video.video import write_clips, write_session
-    from liex_lab.errors import SessionError
-    from liex_lab.pipelines.compare import find_sessions
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.session import stretch, video_path
-
-    given = [places] if isinstance(places, str | Path) else list(places)
-    opened = [Session.open(folder) for folder in find_sessions(given)]
-    named = [(session, str(session.table("sessions")["group"].iloc[0] or "")) for session in opened]
-    chosen = [pair for pair in named if not groups or pair[1] in groups]
-    if not chosen:
-        there = ", ".join(sorted({group for _, group in named} - {""})) or "none"
-        raise SessionError(f"no session is of {' or '.join(groups)}; their groups are {there}")
-    part = start_s is not None or stop_s is not None
-    if part and (len(chosen) > 1 or actions):
-        raise SessionError("a stretch of time is shown of one session, without actions")
-    if not slower > 0:
-        raise SessionError(f"slower is a number above 0, such as 4, got {slower:g}")
-    alone = chosen[0][0]
-    folder = Path(out) if out is not None else alone.path if len(chosen) == 1 else Path()
-    what = stretch(start_s, stop_s) if part else "+".join(actions)
-    path = video_path(folder, alone.name if len(chosen) == 1 else "sessions", what)
-    if path.exists() and not overwrite:
-        raise SessionError(
-            f"{path} exists already; name another place with --out, or say --overwrite (in Python "
-            "out= and overwrite=True)"
-        )
-    if len(chosen) == 1 and not actions:
-        return write_session(
-            alone, path, start_s=start_s, stop_s=stop_s, slower=slower, progress=progress
-        )
-    write_clips(chosen, path, actions, slower=slower, progress=progress)
-    if folder == alone.path:
-        write_report(folder)  # which links to it
-    return path
+def __getattr__(name: str) -> Any:
+    if name not in _JOBS:
+        raise AttributeError(f"module 'liex_lab.api' has no attribute '{name}'")
+    return getattr(import_module(f"liex_lab.pipelines.{_JOBS[name]}"), name)
 
 
 def run_study(
@@ -482,6 +103,8 @@ def run_study(
         StudyError: the study file or its settings cannot be used, or another process is measuring
             the study.
     """
+    from liex_lab.pipelines.correct import correct_session
+    from liex_lab.pipelines.session import run_session
     from liex_lab.pipelines.study.run import run_study as job
 
     return job(
@@ -497,36 +120,6 @@ def run_study(
         board=board,
         describe=correct_session,
     )
-
-
-def describe_session(
-    session: str | Path,
-    facts: Mapping[str, str],
-    *,
-    author: str = "",
-    progress: Progress = silent,
-) -> Path:
-    """Set facts about the animal of a session; updates table `sessions` and the report.
-
-    Nothing is measured again. The facts are part of the log of corrections and can be undone.
-
-    Args:
-        session: the session folder.
-        facts: any of subject_id, group, cage, sex, batch, species (Latin), age (12 weeks, or P12W)
-            and session_start_time (ISO 8601 with a time zone); an empty text means unknown.
-        author: author of the change; "" uses the current account.
-        progress: receives progress reports.
-
-    Returns:
-        The session folder.
-
-    Raises:
-        SessionError: there is no such fact, or another program is correcting the session.
-        PlanError: a value is invalid.
-    """
-    from liex_lab.sessions.correcting import descriptions
-
-    return correct_session(session, descriptions(facts), author=author, progress=progress)
 
 
 def serve_dashboard(
@@ -566,6 +159,7 @@ def serve_dashboard(
         ) from None
     from liex_lab.dashboards.app.data import StudyData
     from liex_lab.dashboards.report.views import write_views
+    from liex_lab.pipelines.correct import correct_session
     from liex_lab.pipelines.region_config import StatedRegions
     from liex_lab.pipelines.training.action_model import suggest
     from liex_lab.sessions.review import FOLDER as REVIEWS
@@ -601,31 +195,6 @@ def serve_dashboard(
         regions=StatedRegions(study),
     )
     serve(app, host, port, lambda found: told(address(host, found, token)))
-
-
-def verify_session(
-    session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
-) -> list[Finding]:
-    """Check whether a session is unchanged since it was written; returns the findings.
-
-    Compares the facts in session.json, the files with their SHA-256, the logs, the model and the
-    corrections.
-
-    Args:
-        session: the session folder.
-        recording: its recording, to check whether re-running reproduces the session, which takes as
-            long as the first run. None skips this.
-        progress: receives progress of the second run.
-
-    Returns:
-        One `Finding` per check; its state is ok, wrong or note.
-
-    Raises:
-        SessionError: there is no session.
-    """
-    from liex_lab.pipelines.verify import verify_session as job
-
-    return job(session, run_session, None if recording is None else str(recording), progress)
 
 
 def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
@@ -664,6 +233,7 @@ def run_scale(
         Numbers, with their definitions and assumptions as text.
     """
     from liex_lab.pipelines.evaluation.scale import evaluate_scale
+    from liex_lab.pipelines.session import run_session
 
     return evaluate_scale(run_session, n_frames, tuple(minutes), progress)
 
@@ -833,17 +403,3 @@ def run_tables(
         progress=progress,
     )
     return [*kept, *write_paper(Path(out), results, further, quick)]
-
-
-def _layout(session: dict[str, Any]) -> Any:
-    """The Rerun layout of a session.json; imported on first use."""
-    from liex_lab.dashboards.replay.layouts import replay_blueprint
-
-    return replay_blueprint(session)
-
-
-def _views(folder: Path) -> Path:
-    """Report and layouts of a session's folder; imported on first use."""
-    from liex_lab.dashboards.report.views import write_views
-
-    return write_views(folder)

@@ -16,6 +16,7 @@ from liex_lab.errors import LiexError, ModelError
 
 _HERE = Path(__file__).resolve().parent
 MODELS = _HERE / "models"
+DEMO = "mouse_walk.mcap"  # the sample recording of `liex demo`
 
 
 def datasets_folder() -> Path:

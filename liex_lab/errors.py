@@ -19,12 +19,12 @@ def printable(text: object) -> str:
         The text; control characters, bidirectional controls and surrogates are escaped. Line ends
             and tabs stay.
     """
-    said = str(text)
-    if said.isascii() and said.isprintable():
-        return said
+    plain = str(text)
+    if plain.isascii() and plain.isprintable():
+        return plain
     return "".join(
         c if c in "\n\t\u200d" or unicodedata.category(c) not in _UNSEEN else ascii(c)[1:-1]
-        for c in said
+        for c in plain
     )
 
 

@@ -8,40 +8,31 @@ with that region alone. If one arena fails, the others continue.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, RecordingError
-from liex_lab.plan import Plan
+from liex_lab.plan import Plan, sections
 from liex_lab.plan.plan import toml_value
-from liex_lab.plan.sections import SeveralArenas
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import unwritable_times
+from liex_lab.runtime import processes, threads
 from liex_lab.runtime.places import inside
-from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene.zones import Corners, masks_apart
+from liex_lab.runtime.progress import Progress, silent, telling_of_compiling
+from liex_lab.scene.zones import masks_apart
 
-from .build import build_recording
+from .build import arenas_of, build_recording, stated_corners
 from .choice import USUAL, fit_plan
 from .compiling import compile_ahead
-from .regions import arenas_of, stated_corners
-from .session import Prepared, check_unused, prepare, read_ahead
-from .shards import MEASURING
-from .workers import WorkerPool
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from liex_lab.sessions import SessionWriter
-    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
+from .session import HEAVY, MEASURING, Prepared, check_unused, prepare, read_ahead
 
 _FACTS = ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age")
 _REMEMBERED_BYTES = 256 * 2**20  # memory for frames that the arenas share to learn their scenes
@@ -62,176 +53,134 @@ class ArenaOutcome:
     error: LiexError | None = None
 
 
-@dataclass
-class _Work:
-    """One arena in progress: its settings and its result."""
-
-    arena: SeveralArenas
-    settings: tuple[str, ...]
-    region_px: Corners
-    inside: NDArray[np.bool_]
-    folder: Path
-    prepared: Prepared | None = None
-    writer: SessionWriter | None = None
-    error: LiexError | None = None
-    session: Path | None = None
-
-    def view(self, frames: Sequence[DepthFrame], first: int) -> list[DepthFrame]:
-        """The frames from index `first` on, with all but the arena's region unread."""
-        import numpy as np
-
-        return [
-            DepthFrame(
-                frame.index, frame.time_ns, np.where(self.inside, frame.depth, np.float32(0))
-            )
-            for frame in frames
-            if frame.index >= first
-        ]
-
-
-def measure_arenas(
+def run_arenas(
     recording: str | Path | Recording,
-    plan: Plan | None,
-    out: str | Path,
+    plan: Plan | None = None,
+    out: str | Path = ".",
     *,
     settings: Sequence[str] = (),
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
-    blueprint: BlueprintMaker | None = None,
-    report: ReportMaker | None = None,
-    pool: WorkerPool | None = None,
+    workers: int = 1,
+    pool: processes.WorkerPool | None = None,
+    report: bool = True,
     progress: Progress = silent,
 ) -> list[ArenaOutcome]:
-    """Measure every arena of a recording, each into its own session folder.
-
-    Unfinished sessions resume. With a worker pool the arenas are measured one after the other, each
-    in shards, and the recording is decoded once per arena.
+    """Measure several arenas in one image, each as a separate session, in one pass.
 
     Args:
-        recording: a path or address, or an open recording.
-        plan: lists the arenas, or states 'auto'; None uses, for each arena, the bundled plan that
-            fits, with the arenas that `settings` state.
-        out: folder of the sessions.
-        settings: changes to the plan if none was named.
+        recording: path of a recording, address of a virtual one, or an open recording.
+        plan: lists `[[arenas]]`, or has `arenas = "auto"`; None selects the bundled plan that fits
+            each arena, with the arenas in `settings`.
+        out: parent of the session folders `<recording's name>-<arena>.liex`.
+        settings: overrides when no plan is given.
         overwrite: replace existing sessions.
-        notes: additional contents of each session.json.
-        blueprint: makes the layout of a replay.
-        report: makes the report in a folder.
-        pool: workers for the shards of a long recording.
-        progress: called frame by frame.
+        notes: additional facts for every session.json.
+        workers: processes for parallel shards of a long recording, one arena at a time; 0 or 1
+            measures all arenas in one pass.
+        pool: a worker pool to use instead.
+        report: whether to write each session's report with its figures.
+        progress: receives progress reports.
 
     Returns:
-        The result of each arena, in the plan's order.
+        For each arena its session folder, or the reason why it could not be measured.
 
     Raises:
-        RecordingError: the recording cannot be opened or read.
-        PlanError: a region lies outside the image, two overlap, or no arena is found.
-        SessionError: a session exists already, or another process writes it.
+        LiexError: the recording or the plan cannot be used, or arenas overlap.
     """
     first = plan or Plan.load(USUAL).with_settings(settings)
-    with build_recording(recording, first, progress) as opened:
-        if told := unwritable_times(opened.times_ns):
-            raise RecordingError(f"of {opened.name} {told}")
+    pool = pool or processes.processes_for(workers or 1)
+    outcomes: dict[str, ArenaOutcome] = {}
+    with (
+        threads.imported_ahead(*HEAVY),
+        telling_of_compiling(progress) as progress,
+        build_recording(recording, first, progress) as opened,
+    ):
+        if problem := unwritable_times(opened.times_ns):
+            raise RecordingError(f"of {opened.name} {problem}")
         compile_ahead(first.animal.skeleton, progress)
         shared = opened.remembering(_REMEMBERED_BYTES)
         arenas = arenas_of(shared, first)
         corners = {one.name: stated_corners(shared, first, one.region) for one in arenas}
         within = masks_apart(corners, opened.width, opened.height)
-        base = first.session.name or opened.name
-        works = []
-        for one in arenas:
-            name = f"{base}-{one.name}"
-            folder = inside(Path(out), name, ".liex")
+        names = [f"{first.session.name or opened.name}-{one.name}" for one in arenas]
+        folders = [inside(Path(out), name, ".liex") for name in names]
+        for folder in folders:
             check_unused(folder, overwrite)
-            chosen = arena_settings(one, name)
-            works.append(_Work(one, chosen, corners[one.name], within[one.name], folder))
-        for work in works:
-            named = plan.with_settings(work.settings) if plan else None
+        going: dict[str, Prepared] = {}
+        for one, name, folder in zip(arenas, names, folders, strict=True):
+            started = time.perf_counter()
+            progress(0, None, f"learning the background and the animal's size in {one.name}")
+            stated = arena_settings(one, name)
+            chosen = [*settings, *stated]
+            own = plan.with_settings(stated) if plan else Plan.load(USUAL).with_settings(chosen)
             try:
-                work.prepared = _prepare(work, named, settings, shared, progress)
+                seen = shared.masked(corners[one.name], lent=True)
+                unnamed = None if plan else chosen
+                fitted = fit_plan(seen, own, settings=unnamed, progress=progress)
+                prepared = prepare(fitted, folder, started, progress)
                 if pool is not None and isinstance(recording, str | Path):
-                    work.prepared.measure_by(pool, recording, progress)
+                    prepared.measure_by(pool, recording, progress)
+                going[one.name] = prepared
             except LiexError as error:
-                work.error = error
-        going = [work for work in works if work.prepared is not None and work.error is None]
-        _measure(going, shared, recording, overwrite, notes, blueprint, report, progress)
-    return [ArenaOutcome(work.arena.name, work.session, work.error) for work in works]
-
-
-def arena_settings(arena: SeveralArenas, name: str) -> tuple[str, ...]:
-    """The settings that turn a plan of several arenas into that of one arena's session, `name`."""
-    told = ["arenas=", f"arena.region={toml_value(arena.region)}", f"session.name={_text(name)}"]
-    for fact in _FACTS:
-        if (value := getattr(arena, fact)) is not None:
-            told.append(f"session.{fact}={_text(value)}")
-    if arena.zones is not None:
-        told.append(f"arena.zones={_text(arena.zones)}")
-    if arena.spine_mm is not None:
-        told.append(f"animal.spine_mm={arena.spine_mm!r}")
-    return tuple(told)
-
-
-def _text(value: str) -> str:
-    return json.dumps(value, ensure_ascii=False)
-
-
-def _prepare(
-    work: _Work,
-    named: Plan | None,
-    settings: Sequence[str],
-    shared: Recording,
-    progress: Progress,
-) -> Prepared:
-    """Learn the arena's scene with the named plan, or with the one that fits."""
-    started = time.perf_counter()
-    progress(0, None, f"learning the background and the animal's size in {work.arena.name}")
-    chosen = [*settings, *work.settings]
-    first = named or Plan.load(USUAL).with_settings(chosen)
-    seen = shared.masked(work.region_px, lent=True)
-    fitted = fit_plan(seen, first, settings=None if named else chosen, progress=progress)
-    return prepare(fitted, work.folder, started, progress)
+                outcomes[one.name] = ArenaOutcome(one.name, error=error)
+        sessions = _measure(going, shared, within, recording, overwrite, notes, report, progress)
+    outcomes |= {name: ArenaOutcome(name, session) for name, session in sessions.items()}
+    return [outcomes[one.name] for one in arenas]
 
 
 def _measure(
-    works: Sequence[_Work],
+    going: Mapping[str, Prepared],
     shared: Recording,
-    source: str | Path | Recording,
+    within: Mapping[str, NDArray[np.bool_]],
+    recording: str | Path | Recording,
     overwrite: bool,
     notes: Mapping[str, Any] | None,
-    blueprint: BlueprintMaker | None,
-    report: ReportMaker | None,
+    report: bool,
     progress: Progress,
-) -> None:
+) -> dict[str, Path]:
     """Measure all frames from the end of the shortest session on, then finish the sessions."""
-    from liex_lab.sessions import SessionWriter
-
-    if not works:
-        return
+    if not going:
+        return {}
     with ExitStack() as stack:
-        for work in works:
-            assert work.prepared is not None
-            work.writer = stack.enter_context(
-                SessionWriter(
-                    work.folder,
-                    work.prepared.origin,
-                    overwrite=overwrite,
-                    blueprint=blueprint,
-                    report=report,
-                )
-            )
-            work.writer.resume(partial(_depth, work.prepared.recording))
-        done = [(work, work.writer.n_frames) for work in works if work.writer is not None]
-        with closing(read_ahead(shared, min(n for _, n in done))) as chunks:
+        writers = {
+            name: stack.enter_context(prepared.writing(overwrite, report))
+            for name, prepared in going.items()
+        }
+        done = {name: writer.n_frames for name, writer in writers.items()}
+        with closing(read_ahead(shared, min(done.values()))) as chunks:
             for frames in chunks:
-                for work, first in done:
-                    own = work.view(frames, first)
-                    if own and work.prepared is not None and work.writer is not None:
-                        work.prepared.measure(own, work.writer)
+                for name, prepared in going.items():
+                    left = [frame for frame in frames if frame.index >= done[name]]
+                    if left:
+                        prepared.measure(_cut_out(left, within[name]), writers[name])
                 progress(frames[-1].index + 1, len(shared), MEASURING)
-        for work in works:
-            if work.prepared is not None and work.writer is not None:
-                work.session = work.prepared.finish(work.writer, source, notes).path
+        return {
+            name: prepared.finish(writers[name], recording, notes).path
+            for name, prepared in going.items()
+        }
 
 
-def _depth(recording: Recording, row: int) -> NDArray[np.float32]:
-    return recording.frame(row).depth
+def _cut_out(frames: Sequence[DepthFrame], inside: NDArray[np.bool_]) -> list[DepthFrame]:
+    """The frames with all pixels outside an arena's region unread."""
+    return [
+        DepthFrame(frame.index, frame.time_ns, np.where(inside, frame.depth, np.float32(0)))
+        for frame in frames
+    ]
+
+
+def arena_settings(arena: sections.SeveralArenas, name: str) -> tuple[str, ...]:
+    """The settings that turn a plan of several arenas into that of one arena's session, `name`."""
+    settings = [
+        "arenas=",
+        f"arena.region={toml_value(arena.region)}",
+        f"session.name={toml_value(name)}",
+    ]
+    for fact in _FACTS:
+        if (value := getattr(arena, fact)) is not None:
+            settings.append(f"session.{fact}={toml_value(value)}")
+    if arena.zones is not None:
+        settings.append(f"arena.zones={toml_value(arena.zones)}")
+    if arena.spine_mm is not None:
+        settings.append(f"animal.spine_mm={arena.spine_mm!r}")
+    return tuple(settings)

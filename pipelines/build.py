@@ -12,28 +12,292 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from liex_lab.actions import storage, timeline
+from liex_lab.behaviour import activity, bouts
+from liex_lab.body.skeleton import FOREGROUNDS, VIEWS, Skeleton
+from liex_lab.catalog import find_model, sha256
 from liex_lab.errors import PlanError
-from liex_lab.plan import Plan, known_plans
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.model import Model
+from liex_lab.estimation.session_shape import labels_of
+from liex_lab.optics.camera import Camera, Distortion, Lens, preset
+from liex_lab.optics.refraction import Water
+from liex_lab.plan import Plan, known_plans, sections
+from liex_lab.recordings import depth_kernels, frame, open_recording, rectify
+from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
-
-from .origin import animal_of, build_zones
-from .regions import cut_out, region_of, stated_floor
+from liex_lab.scene import background_segmenter, hand_segmenter, height_maps, support_plane
+from liex_lab.scene.background import sample_frames, sampled_scene, stride_for
+from liex_lab.scene.floor import Floor
+from liex_lab.scene.learning import learn_scene
+from liex_lab.scene.scene import UNKNOWN, Arena, find_arena, plane_of
+from liex_lab.scene.zones import Corners, DrawnZone, Zone, read_zones, region_corners_px
+from liex_lab.sessions import Provenance, cutouts
+from liex_lab.tracking.own_shape import StatedShape
+from liex_lab.tracking.tracker import FrameTracker
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from liex_lab.actions.timeline import TimelineModel
-    from liex_lab.behaviour.bouts import MouseRules
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.optics.camera import Camera, Distortion, Lens
-    from liex_lab.optics.refraction import Water
-    from liex_lab.plan.sections import SharedShape
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.scene.height_maps import Segmenter
-    from liex_lab.tracking.own_shape import StatedShape
-    from liex_lab.tracking.tracker import FrameTracker
+
+# least and largest length of a user's own animal, over the home length
+_SPANS = (0.6, 1.8)
+
+
+def animal_of(plan: Plan) -> sections.AnimalSettings:
+    """The plan's animal, completed from the skeleton if that is the user's own.
+
+    Its name is then the skeleton's, and its spine 0.6 to 1.8 times the skeleton's length.
+
+    Raises:
+        LiexError: the skeleton's file cannot be read.
+    """
+    animal = plan.animal
+    if not animal.skeleton.endswith(".toml"):
+        return animal
+    skeleton = Skeleton.load(animal.skeleton)
+    low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
+    own = {"name": skeleton.name, "spine_min_mm": low, "spine_max_mm": high}
+    usual = type(animal).model_fields  # a plan that was written to a file states its defaults
+    return animal.model_copy(
+        update={k: v for k, v in own.items() if getattr(animal, k) == usual[k].default}
+    )
+
+
+def build_provenance(
+    recording: Recording, plan: Plan, tracker: FrameTracker, progress: Progress = silent
+) -> Provenance:
+    """The session's provenance: recording, camera, plan, model, animal, arena, zones.
+
+    Args:
+        recording: an open recording; hashing its content takes the longest.
+        plan: names the model and the zones.
+        tracker: the prepared tracker: background, animal's size, girth.
+        progress: called while the content is hashed.
+    """
+    # cached by the recording; takes the longest, so it shows the progress
+    recording.digest(progress)
+    arena, zones = build_arena(tracker.scene, plan)
+    described = None  # a hand has no floor
+    if isinstance(tracker.scene, background_segmenter.BackgroundSubtraction):
+        described = replace(tracker.scene.described(), outline=arena)
+    return Provenance.of(
+        recording,
+        tracker.scene.floor,
+        tracker.estimator.skeleton,
+        plan,
+        model={"name": plan.estimation.model, "sha256": sha256(find_model(plan.estimation.model))},
+        animal_size=animal_facts(plan, tracker),
+        arena=arena,
+        zones=zones,
+        scene=described,
+        background=build_background(recording, plan, tracker.scene),
+    )
+
+
+def animal_facts(plan: Plan, tracker: FrameTracker) -> dict[str, Any]:
+    """The animal's size, girth and shape for session.json."""
+    shared = plan.animal.shared
+    origin = "estimated over the recording"
+    if tracker.size_origin == "plan":
+        is_shared = shared is not None and plan.animal.spine_mm is None
+        origin = f"shared by {shared.by}" if shared and is_shared else "stated in the plan"
+    return {
+        "spine_mm": round(tracker.spine_mm, 3),
+        "origin": origin,
+        "girth": round(tracker.body.girth, 3),
+        **({} if tracker.shape is None else {"shape": tracker.shape.to_dict()}),
+    }
+
+
+def build_background(
+    recording: Recording, plan: Plan, segmenter: height_maps.Segmenter
+) -> NDArray[np.uint16] | None:
+    """The still scene (H, W) mm behind the replay's cut-outs; None if the replay has none.
+
+    Args:
+        recording: an open recording.
+        plan: its section `replay`.
+        segmenter: the learned segmentation, which separates an animal at rest from the scene.
+    """
+    if plan.replay.depth not in (cutouts.ANIMAL, cutouts.ARENA):
+        return None
+    return cutouts.still_scene(
+        recording,
+        segmenter if isinstance(segmenter, background_segmenter.BackgroundSubtraction) else None,
+    )
+
+
+def build_arena(scene: height_maps.Segmenter, plan: Plan) -> tuple[Arena, tuple[Zone, ...]]:
+    """The outline of the arena's floor, and the plan's zones in it, arena frame, mm.
+
+    Args:
+        scene: the learned segmentation; a hand has no arena, so its outline is unknown.
+        plan: names the file of zones.
+    """
+    arena = UNKNOWN
+    if isinstance(scene, background_segmenter.BackgroundSubtraction):
+        arena = find_arena(scene.background, scene.floor.for_camera(scene.grid), scene.grid)
+    return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
+
+
+def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
+    """The zones of the plan as drawn; () if it names none.
+
+    Raises:
+        PlanError: the file of zones cannot be used.
+    """
+    return read_zones(plan.arena.zones) if plan.arena.zones else ()
+
+
+def build_surroundings(provenance: Provenance) -> activity.Surroundings:
+    """Arena, zones and water surface for the measures of behaviour."""
+    surface = activity.surface_height_mm(provenance.floor_distance_mm, provenance.optics)
+    return activity.Surroundings(
+        provenance.arena, [zone.name for zone in provenance.zones], surface
+    )
+
+
+def session_bytes(recording: Recording, plan: Plan, length_mm: float, distance_mm: float) -> int:
+    """Size of a recording's session on disk, bytes, within a factor of two.
+
+    Args:
+        recording: an open recording.
+        plan: the animal's skeleton, and how much of the depth is kept.
+        length_mm: of the animal.
+        distance_mm: of the animal from the camera.
+    """
+    rows = sorted({0, len(recording) // 2})
+    images = [depth_kernels.to_millimetres(recording.frame(row).depth) for row in rows]
+    n_joints = Skeleton.load(plan.animal.skeleton).n_joints
+    length_px = recording.camera.fx * length_mm / distance_mm
+    return cutouts.needed_bytes(images, len(recording), n_joints, length_px, plan.replay.depth)
+
+
+# Regions that a plan states, in the images of a recording, and proposed arenas.
+
+
+_N_SAMPLED = 96
+
+
+def cut_out(recording: Recording, plan: Plan) -> Recording:
+    """The recording with all but `arena.region` unread; unchanged if the plan states none.
+
+    Raises:
+        PlanError: the region lies outside the image.
+        EstimationError: it is stated in millimetres, and no floor is found.
+    """
+    if plan.arena.region is None or recording.region_px:
+        return recording
+    return recording.masked(stated_corners(recording, plan, plan.arena.region))
+
+
+def stated_corners(recording: Recording, plan: Plan, region: sections.Region) -> Corners:
+    """The corners (u, v) px of a region in the images of a recording.
+
+    Args:
+        recording: an ideal pinhole's recording, of the whole image.
+        plan: states the floor, or the animals that stand on it.
+        region: the region.
+    """
+    floor = None if region.unit == "px" else _floor_of_picture(recording, plan)
+    return region_corners_px(region, recording.camera, floor)
+
+
+def pinned(plan: Plan, recording: Recording) -> Plan:
+    """The plan with the region of a recording, which was cut out, in pixels."""
+    if not recording.region_px:
+        return plan
+    corners = [list(corner) for corner in recording.region_px]
+    return plan.with_settings([f"arena.region={corners}"])
+
+
+def stated_floor(camera: Camera, plan: Plan) -> Floor | None:
+    """The floor that the plan states (`arena.floor`); None if it is to be found.
+
+    Raises:
+        PlanError: the floor does not face the camera.
+    """
+    floor = plan.arena.floor
+    return None if isinstance(floor, str) else plane_of(floor.point, floor.normal, camera)
+
+
+def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
+    """The pixels (H, W) bool of the plan's `arena.region`; None for all.
+
+    Raises:
+        PlanError: the region lies outside the image.
+    """
+    corners = recording.region_px
+    if not corners and plan.arena.region is not None:
+        corners = stated_corners(recording, plan, plan.arena.region)
+    return frame.region_mask(corners, recording.width, recording.height) if corners else None
+
+
+def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
+    """The floor that the plan states, or the one on which animals stand in the whole image."""
+    stated = stated_floor(recording.camera, plan)
+    if stated is not None:
+        return stated
+    found = support_plane.find_support_plane(_sampled(recording, plan)[0]).floor
+    return found.for_camera(recording.camera)
+
+
+def _sampled(recording: Recording, plan: Plan) -> tuple[support_plane.SampledScene, int]:
+    """Frames spread over a recording with their background, and the stride of their pixels."""
+    stride = stride_for(recording, animal_of(plan).spine_min_mm)
+    sample = sample_frames(recording, _N_SAMPLED, stride)
+    return sampled_scene(sample, recording.camera.every(stride), target_of(plan)), stride
+
+
+def target_of(plan: Plan) -> support_plane.TargetAnimal:
+    """The animal of a plan as it is searched for in depth images."""
+    animal = animal_of(plan)
+    return support_plane.TargetAnimal(
+        (animal.spine_min_mm, animal.spine_max_mm),
+        plan.foreground.min_height_mm,
+        Skeleton.load(animal.skeleton).view,
+    )
+
+
+def arenas_of(recording: Recording, plan: Plan) -> list[sections.SeveralArenas]:
+    """The arenas of a recording of the whole image, as listed in the plan or as proposed.
+
+    Raises:
+        PlanError: the setting is 'auto', and fewer than two are found.
+    """
+    if plan.arenas != "auto":
+        return list(plan.arenas or ())
+    found = propose_arenas(recording, plan)
+    if len(found) < 2:
+        raise PlanError(
+            "arenas = 'auto' proposes several arenas in which animals move, and fewer than two are "
+            "found in this image; leave the line out, or list them as [[arenas]] with name and "
+            "region"
+        )
+    return found
+
+
+def propose_arenas(recording: Recording, plan: Plan) -> list[sections.SeveralArenas]:
+    """The arenas in which animals move, from left to right and top to bottom of the whole image.
+
+    Returns:
+        Two to eight of them, with disjoint polygons; [] if only one is found.
+    """
+    view = Skeleton.load(plan.animal.skeleton).view
+    if view.frame != VIEWS[0] or recording.region_px:
+        return []
+    scene, stride = _sampled(recording, plan)
+    return [
+        sections.SeveralArenas.model_validate(
+            {
+                "name": f"arena{k}",
+                "region": [[float(stride * u), float(stride * v)] for u, v in corners],
+            }
+        )
+        for k, corners in enumerate(support_plane.arenas_apart(scene), 1)
+    ]
 
 
 _RULED = "mouse"  # the animal that the rules were made for
@@ -56,10 +320,8 @@ def build_recording(
         RecordingError: the recording cannot be opened.
         PlanError: the plan's region lies outside the image.
     """
-    from liex_lab.recordings.rectify import mirrored, rectified
-
-    seen = rectified(open_planned(recording, plan, progress), build_water(plan))
-    return cut_out(mirrored(seen) if plan.recording.mirrored else seen, plan)
+    seen = rectify.rectified(open_planned(recording, plan, progress), build_water(plan))
+    return cut_out(rectify.mirrored(seen) if plan.recording.mirrored else seen, plan)
 
 
 def open_planned(
@@ -82,8 +344,6 @@ def open_planned(
         RecordingError: the recording cannot be opened, or is cut short and the plan does not accept
             that.
     """
-    from liex_lab.recordings import open_recording
-
     settings = plan.recording
     if isinstance(recording, str | Path):
         recording = open_recording(
@@ -101,16 +361,12 @@ def open_planned(
 
 def build_water(plan: Plan) -> Water | None:
     """The plan's water surface; None if the plan states no height of one."""
-    from liex_lab.optics.refraction import Water
-
     stated = plan.water.model_dump()
     return Water(**stated) if stated["height_mm"] is not None else None
 
 
 def _stated_lens(plan: Plan) -> Lens | None:
     """The plan's camera if fully stated, a placeholder for its preset, or None."""
-    from liex_lab.optics.camera import Lens
-
     stated = {name: getattr(plan.camera, name) for name in ("fx", "fy", "cx", "cy")}
     if None in stated.values() and plan.camera.preset is not None:
         return Lens(1.0, 1.0, 0.0, 0.0)  # its numbers follow once the image size is known
@@ -118,7 +374,6 @@ def _stated_lens(plan: Plan) -> Lens | None:
 
 
 def _stated_distortion(plan: Plan) -> Distortion | None:
-    from liex_lab.optics.camera import Distortion
 
     return Distortion.of(plan.camera.distortion_model or "plumb_bob", plan.camera.distortion or [])
 
@@ -126,8 +381,6 @@ def _stated_distortion(plan: Plan) -> Distortion | None:
 def _overruled(camera: Camera, plan: Plan) -> Camera:
     """The camera with the plan's values."""
     if plan.camera.preset is not None:
-        from liex_lab.optics.camera import preset
-
         camera = preset(plan.camera.preset, camera.width, camera.height)
     stated: dict[str, Any] = plan.camera.model_dump(
         exclude_none=True, exclude={"preset", "distortion", "distortion_model"}
@@ -142,8 +395,6 @@ def plan_of(animal: str) -> Plan:
 
     The latter expects a model `NAME.npz` with the name of the skeleton's file.
     """
-    from liex_lab.body.skeleton import Skeleton
-
     if animal in known_plans():
         return Plan.load(animal)
     plan = Plan.from_table(
@@ -165,9 +416,6 @@ def build_estimator(plan: Plan) -> PoseEstimator:
         ModelError: there is no such model, or its file is damaged.
         PlanError: the model was made for another skeleton than the plan's.
     """
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.catalog import find_model, sha256
-
     path = find_model(plan.estimation.model)
     estimator = kept_estimator(path, sha256(path), plan.estimation.n_candidates or 0)
     wanted = plan.animal.skeleton
@@ -191,9 +439,6 @@ def kept_estimator(path: Path, digest: str, n_candidates: int) -> PoseEstimator:
         digest: SHA-256 of its content, so that a changed file is loaded again.
         n_candidates: initial poses per frame; 0 uses the method's default.
     """
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.estimation.model import Model
-
     return PoseEstimator(Model.load(path), n_candidates)
 
 
@@ -212,9 +457,6 @@ def build_tracker(
         EstimationError: no floor or no animal is found in the sampled frames.
         PlanError: the file of zones or the model does not fit.
     """
-    from liex_lab.body.skeleton import Skeleton
-    from liex_lab.tracking.tracker import FrameTracker
-
     build_zones(plan)  # errors in their file are raised before any work is done
     n_frames = plan.foreground.n_background_frames
     stated = Skeleton.load(plan.animal.skeleton)
@@ -243,8 +485,6 @@ def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:
     Raises:
         PlanError: the shape is of another skeleton.
     """
-    from liex_lab.tracking.own_shape import StatedShape
-
     shared = plan.animal.shared
     if shared is None:
         return None
@@ -260,11 +500,9 @@ def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:
     return StatedShape(shape_labels(shape), shared.girth, shared.by)
 
 
-def shape_labels(shape: SharedShape) -> NDArray[np.float64]:
+def shape_labels(shape: sections.SharedShape) -> NDArray[np.float64]:
     """A plan's shape as (K,) labels, see `session_shape.labels_of`."""
     import numpy as np
-
-    from liex_lab.estimation.session_shape import labels_of
 
     columns = (np.array(column) for column in (shape.joints_moved, shape.width, shape.height))
     return labels_of(*columns)
@@ -272,7 +510,7 @@ def shape_labels(shape: SharedShape) -> NDArray[np.float64]:
 
 def build_scene(
     recording: Recording, plan: Plan, skeleton: Skeleton, n_frames: int
-) -> tuple[Segmenter, NDArray[np.float32]]:
+) -> tuple[height_maps.Segmenter, NDArray[np.float32]]:
     """The learned segmentation and the sampled frames it was learned from.
 
     Background subtraction with a floor plane; segmentation by distance for a hand.
@@ -290,10 +528,6 @@ def build_scene(
         EstimationError: no floor or no animal is found in the sample.
         PlanError: the plan states a region or a floor for a hand.
     """
-    from liex_lab.body.skeleton import FOREGROUNDS
-    from liex_lab.scene.hand_segmenter import HandSegmenter
-    from liex_lab.scene.learning import learn_scene
-
     animal = animal_of(plan)
     foreground = plan.foreground
     region = region_of(recording, plan)
@@ -302,9 +536,9 @@ def build_scene(
         if region is not None or floor is not None:
             raise PlanError(
                 "arena.region and arena.floor are for animals before a still background, and the "
-                f"{skeleton.name} is told by its distance; set foreground.near_mm and far_mm"
+                f"{skeleton.name} is separated by its distance; set foreground.near_mm and far_mm"
             )
-        return HandSegmenter.learn(
+        return hand_segmenter.HandSegmenter.learn(
             recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
         )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
@@ -313,14 +547,12 @@ def build_scene(
     )
 
 
-def build_rules(plan: Plan) -> MouseRules:
+def build_rules(plan: Plan) -> bouts.MouseRules:
     """Thresholds of the rules that name behaviours, from the plan's section `behaviour`."""
-    from liex_lab.behaviour.bouts import MouseRules
-
-    return MouseRules(**plan.behaviour.model_dump())
+    return bouts.MouseRules(**plan.behaviour.model_dump())
 
 
-def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
+def build_recogniser(plan: Plan, skeleton: Skeleton) -> timeline.TimelineModel | None:
     """The plan's action recogniser, named or bundled; None if absent.
 
     Without a recogniser rules name the actions, or nothing does, see `why_nameless`.
@@ -334,12 +566,10 @@ def build_recogniser(plan: Plan, skeleton: Skeleton) -> TimelineModel | None:
         ModelError: there is no such model.
         PlanError: the model was made for another skeleton.
     """
-    from liex_lab.actions.storage import bundled_action_models, load_action_model
-
     name = plan.actions.model
-    if name == "rules" or (name is None and skeleton.name not in bundled_action_models()):
+    if name == "rules" or (name is None and skeleton.name not in storage.bundled_action_models()):
         return None
-    model = load_action_model(name or skeleton.name)
+    model = storage.load_action_model(name or skeleton.name)
     if model.skeleton != skeleton.name:
         raise PlanError(
             f"the action model '{name}' was made for the skeleton {model.skeleton}, but the plan "

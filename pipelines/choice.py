@@ -11,20 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from liex_lab.errors import EstimationError, LiexError, MisfitError
+from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.plan import Plan, known_plans
 from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.rectify import mirrored
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene import background_segmenter, hand_segmenter
+from liex_lab.tracking.residual import SampleFit
+from liex_lab.tracking.tracker import FrameTracker
 
-from .build import build_tracker
-from .origin import animal_of
-
-if TYPE_CHECKING:
-    from liex_lab.estimation.estimator import PoseEstimator
-    from liex_lab.tracking.residual import SampleFit
-    from liex_lab.tracking.tracker import FrameTracker
+from .build import animal_of, build_tracker
 
 USUAL = "mouse"  # tried first if no plan is named
 _HANDFUL = "foreground.n_background_frames=24"
@@ -74,14 +72,14 @@ class Proposal:
 
     Attributes:
         plan: name of the bundled plan, or of the given plan's animal; None if no plan fits.
-        says: how it fits, or the evidence against each plan.
+        summary: how it fits, or the evidence against each plan.
         n_animals: objects of the animal's size in view at once; None if no plan fits.
         problems: sentences about several animals, and about a given plan that does not fit.
         is_given: whether the plan that fits is the given one.
     """
 
     plan: str | None
-    says: str
+    summary: str
     n_animals: int | None = None
     problems: tuple[str, ...] = ()
     is_given: bool = False
@@ -98,17 +96,17 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
         looks += [try_plan(recording, name) for name in known_plans() if not _is(given, name)]
     found = best(looks)
     if found is None or found.fit is None:
-        says = ". ".join(f"{one.name}: {', '.join(one.misfits)}" for one in looks)
-        return Proposal(None, f"none fits. {says}")
+        summary = ". ".join(f"{one.name}: {', '.join(one.misfits)}" for one in looks)
+        return Proposal(None, f"none fits. {summary}")
     fit = found.fit
-    says = (
+    summary = (
         f"{found.name} fits: {fit.spine_mm:.0f} mm long, expected error {fit.error_mm:.1f} mm, its "
         f"body covers {fit.covered:.0%} of what is seen"
     )
     problems = list(_other_hand(recording, found, plan))
     if plan is not None and found is not first:
         problems.append(
-            f"the plan of the {first.name} does not fit: {', and '.join(first.misfits)}; say "
+            f"the plan of the {first.name} does not fit: {', and '.join(first.misfits)}; use "
             f"--plan {found.name}"
         )
     if fit.n_animals > 1:
@@ -117,13 +115,11 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
             "them one at a time"
         )
     given_fits = plan is not None and found is first
-    return Proposal(found.name, says, fit.n_animals, tuple(problems), given_fits)
+    return Proposal(found.name, summary, fit.n_animals, tuple(problems), given_fits)
 
 
 def _other_hand(recording: Recording, found: PlanFit, plan: Plan | None) -> tuple[str, ...]:
     """A problem if the hand is a left one or its images are mirrored; () otherwise."""
-    from liex_lab.recordings.rectify import mirrored
-
     stated = plan is not None and plan.recording.mirrored is not None
     if found.name != "hand" or stated or found.fit is None:
         return ()
@@ -131,7 +127,7 @@ def _other_hand(recording: Recording, found: PlanFit, plan: Plan | None) -> tupl
     if other is None or other.error_mm > _MIRRORED_BELOW * found.fit.error_mm:
         return ()
     return (
-        "it is a left hand, or the pictures are mirrored: the expected error is "
+        "it is a left hand, or the images are mirrored: the expected error is "
         f"{found.fit.error_mm:.1f} mm as they are and {other.error_mm:.1f} mm mirrored; a run "
         "finds that by itself, and --set recording.mirrored=true states it",
     )
@@ -178,7 +174,7 @@ def fit_plan(
             return replace(found, tracker=replace(found.tracker, doubtful_mm=0.0))
     if cause is not None and accepted:
         raise cause
-    progress(0, None, "looking which plan fits")
+    progress(0, None, "checking which plan fits")
     fitting = best([try_plan(recording, name) for name in known_plans() if not _is(plan, name)])
     if fitting is not None and settings is not None:
         chosen = Plan.load(fitting.name).with_settings(settings)
@@ -198,11 +194,13 @@ def fit_plan(
 
 def _shows_an_animal(tracker: FrameTracker) -> bool:
     """Whether anything moved, or the body covers enough of what rises above the floor."""
-    from liex_lab.scene.background_segmenter import BackgroundSubtraction
-
     scene = tracker.scene
     fit = tracker.sample_fit
-    if not isinstance(scene, BackgroundSubtraction) or scene.support_plane is None or fit is None:
+    if (
+        not isinstance(scene, background_segmenter.BackgroundSubtraction)
+        or scene.support_plane is None
+        or fit is None
+    ):
         return True
     return scene.support_plane.moves or fit.covered >= _SOME_COVERED
 
@@ -254,7 +252,7 @@ def _refusal(plan: Plan, misfits: Sequence[str], fitting: PlanFit | None) -> str
         )
     return (
         f"{what}, while the plan '{fitting.name}' fits ({fitting.fit.spine_mm:.0f} mm long, "
-        f"expected error {fitting.fit.error_mm:.1f} mm); say --plan {fitting.name}, or add "
+        f"expected error {fitting.fit.error_mm:.1f} mm); use --plan {fitting.name}, or add "
         "--accept (in Python the setting 'estimation.accept_misfit=true') to measure it all the "
         "same"
     )
@@ -262,33 +260,24 @@ def _refusal(plan: Plan, misfits: Sequence[str], fitting: PlanFit | None) -> str
 
 def _right_way_round(found: Fitted, progress: Progress) -> Fitted:
     """The same, or mirrored if the images show a hand and fit better mirrored."""
-    from liex_lab.recordings.rectify import mirrored
-    from liex_lab.scene.hand_segmenter import HandSegmenter
-
     plan = found.plan
     fit = found.tracker.sample_fit
-    is_hand = isinstance(found.tracker.scene, HandSegmenter)
+    is_hand = isinstance(found.tracker.scene, hand_segmenter.HandSegmenter)
     if not is_hand or plan.recording.mirrored is not None or fit is None:
         return found
     animal = animal_of(plan)
     if not fit.has_length(animal.spine_min_mm, animal.spine_max_mm):
         return found  # not a hand
-    progress(0, None, "looking which hand it is")
-    handful = plan.with_settings([_HANDFUL])
+    progress(0, None, "checking which hand it is")
     turned = mirrored(found.recording, lent=True)
-    try:
-        other = build_tracker(turned, handful).sample_fit
-    except EstimationError:
-        other = None
-    error_mm = fit.error_mm
-    if other is None or other.error_mm > _MIRRORED_BELOW * error_mm:
-        settled = plan.with_settings(["recording.mirrored=false"])
-        return Fitted(found.recording, settled, found.tracker, found.misfits, found.notes)
+    other = try_plan(turned, plan).fit
+    if other is None or other.error_mm > _MIRRORED_BELOW * fit.error_mm:
+        return replace(found, plan=plan.with_settings(["recording.mirrored=false"]))
     settled = plan.with_settings(["recording.mirrored=true"])
     tracker = build_tracker(turned, settled)
     note = (
-        f"a left hand or mirrored pictures: expected error {other.error_mm:.1f} mm mirrored, "
-        f"{error_mm:.1f} mm as they are, so left and right were exchanged (recording.mirrored)"
+        f"a left hand or mirrored images: expected error {other.error_mm:.1f} mm mirrored, "
+        f"{fit.error_mm:.1f} mm as they are, so left and right were exchanged (recording.mirrored)"
     )
     return Fitted(
         turned, settled, tracker, misfits_of(tracker.sample_fit, settled), (*found.notes, note)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from liex_lab.dashboards.figures import sets
 
 from liex_lab.behaviour.cohort import (
     ENGINES,
@@ -30,11 +31,9 @@ from liex_lab.behaviour.cohort import (
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan.study import Study
 from liex_lab.plan.subject import same
-from liex_lab.runtime.durable import replacing, write_whole
+from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.text_files import read_texts, write_csv
-from liex_lab.sessions import Session
-from liex_lab.sessions.evidence import link_to
+from liex_lab.sessions import Session, evidence
 from liex_lab.sessions.folder import FAILED_FILE, read_failure
 from liex_lab.sessions.verdict import LOOK_AT_IT, OTHER_ANIMAL, Entry, read_verdict
 from liex_lab.tables.schema import dictionary, from_pandas, write_table
@@ -46,7 +45,7 @@ _SET_ASIDE = re.compile(r"\.(?:outdated(?:-\d+)?|old|part)[/\\]")
 _OBSERVED_SHARES = 8  # since this schema version shares are of the observed frames
 
 
-def compare_sessions(
+def compare_groups(
     places: Sequence[str | Path],
     out: str | Path,
     measures: Sequence[str] = (),
@@ -55,31 +54,29 @@ def compare_sessions(
     animals: str | Path | None = None,
     engine: str = "auto",
     only_trusted: bool = False,
+    figures: bool = True,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Compare the groups of all sessions in the given folders and write the tables.
-
-    Writes stats.parquet, stats.csv, sessions.csv, columns.json, results.txt, methods.txt and
-    comparison.json, which lists the sessions' folders.
+    """Compare groups of sessions; writes tables, a methods text, and figures.
 
     Args:
-        places: study files, session folders, or folders with sessions at any depth.
-        out: folder of the tables; it is created if missing.
+        places: study files, session folders, or folders that contain sessions at any depth.
+        out: output folder; created if needed.
         measures: columns of the summary; () uses the default ones and every action's share.
         reference: compare with this group only; None compares all pairs.
-        animals: a CSV with `subject_id` and any of group, cage, sex, batch, which overrides the
-            sessions' values.
+        animals: a CSV with `subject_id` and any of group, cage, sex, batch; it overrides the
+            sessions' own facts.
         engine: `auto`, `permutation` or `mixed`.
-        only_trusted: leave out sessions that need review.
-        progress: called session by session.
+        only_trusted: exclude sessions that need review.
+        figures: whether to draw the figures, too.
+        progress: receives progress by session and figure.
 
     Returns:
-        `stats`: the table's rows; `folder`: of the files; `sessions`: a sentence that accounts for
-            every session; `check`: sentences on possible errors.
+        `stats`: the table's rows; `folder`: the output folder; `figures`: their paths; `sessions`:
+            a sentence that accounts for every session; `check`: warnings.
 
     Raises:
-        SessionError: there are no two groups, two sessions of one recording state different
-            animals, or a folder, column, engine or CSV cannot be used.
+        SessionError: there are no two groups, or a folder, column, engine or CSV cannot be used.
     """
     if engine not in ENGINES:
         raise SessionError(f"the engine is one of {', '.join(ENGINES)}, got '{engine}'")
@@ -120,14 +117,42 @@ def compare_sessions(
         )
     stats = compare(table, wanted, reference, engine=engine)
     target = Path(out)
+    _write_tables(target, stats, table, sessions, reference, accounted, check)
+    found = {"stats": stats, "folder": target, "sessions": accounted, "check": check}
+    files: list[Path] = []
+    if figures:
+        drawn = comparison_figures(target)
+        files, _ = sets.write_figures(drawn, target / sets.FOLDER, ("svg", "pdf"), progress)
+    return found | {"figures": files}
+
+
+def comparison_figures(folder: Path, only: Sequence[str] = ()) -> Iterator[sets.Drawn]:
+    """The figures of a comparison, from its tables; those of other measures are removed."""
+    table, stats, sessions = sets.read_comparison(folder)
+    measures = [str(name) for name in dict.fromkeys(stats["measure"])]
+    sets.check_names(only, ["effects", *measures, *sets.OF_STUDY])
+    sets.remove_others(folder / sets.FOLDER, measures)
+    return sets.comparison_figures(table, stats, sessions, only)
+
+
+def _write_tables(
+    target: Path,
+    stats: pd.DataFrame,
+    table: pd.DataFrame,
+    sessions: Mapping[str, Session],
+    reference: str | None,
+    accounted: str,
+    check: Sequence[str],
+) -> None:
+    """Write the files of a comparison, each as a whole."""
     target.mkdir(parents=True, exist_ok=True)
-    with replacing(target / "stats.parquet") as part:
+    with durable.replacing(target / "stats.parquet") as part:
         write_table(part, STATS, from_pandas(stats), {"table": "stats"})
     for name, written in (("stats", stats), ("sessions", table)):
-        with replacing(target / f"{name}.csv") as part:
-            write_csv(written, part)
+        with durable.replacing(target / f"{name}.csv") as part:
+            text_files.write_csv(written, part)
     columns = [entry for entry in dictionary(STATS) if entry["table"] == "stats"]
-    places_of = [link_to(session.path, target)["path"] for session in sessions.values()]
+    places_of = [evidence.link_to(session.path, target)["path"] for session in sessions.values()]
     document = {
         "sessions": places_of,
         "reference": reference,
@@ -145,8 +170,7 @@ def compare_sessions(
         "methods.txt": methods(stats, table, [accounted, *warned]),
     }
     for name, text in texts.items():
-        write_whole(target / name, f"{text}\n")
-    return {"stats": stats, "folder": target, "sessions": accounted, "check": check}
+        durable.write_whole(target / name, f"{text}\n")
 
 
 def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
@@ -239,18 +263,18 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
         SessionError: two sessions of one recording are of two animals.
     """
     known: dict[str, str] = {}
-    whose: dict[str, str] = {}
+    animals: dict[str, str] = {}
     copies: dict[str, str] = {}
     for key, session in sessions.items():
-        whose[key] = ", ".join(session.table("sessions")["subject_id"].astype(str))
+        animals[key] = ", ".join(session.table("sessions")["subject_id"].astype(str))
         region = session.metadata.get("plan", {}).get("arena", {}).get("region")
         numbers = session.summary.select_dtypes("number").to_numpy().tolist()
         marks = (f"{session.metadata['input']['sha256']} {region}", str(numbers))
         twin = next((known[mark] for mark in marks if mark in known), key)
-        if same(whose[twin]) != same(whose[key]):
+        if same(animals[twin]) != same(animals[key]):
             raise SessionError(
-                f"{key} and {twin} are of the same recording, but of the animals {whose[key]} and "
-                f"{whose[twin]}; remove one of them, or correct the animal of one with `liex "
+                f"{key} and {twin} are of the same recording, but of the animals {animals[key]} "
+                f"and {animals[twin]}; remove one of them, or correct the animal of one with `liex "
                 "describe SESSION subject_id=NAME`"
             )
         if twin != key:
@@ -284,7 +308,7 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
 def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
     """The table with group, cage, sex and batch overridden by a CSV of the animals."""
     try:
-        stated = read_texts(path)
+        stated = text_files.read_texts(path)
     except (OSError, ValueError) as error:
         raise SessionError(
             f"{path} should be a CSV with the column subject_id, but: {error}; correct it"

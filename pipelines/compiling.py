@@ -17,15 +17,14 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 from liex_lab.catalog import MODELS
-from liex_lab.runtime.processes import own_python
+from liex_lab.runtime.processes import n_cores, own_python
 from liex_lab.runtime.progress import COMPILING, Progress, silent
-
-from .workers import n_cores
 
 KERNELS = Path(__file__).with_name("kernels.json")
 _FEWEST_CORES = 2
@@ -53,15 +52,9 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     if done is None or done.is_file():
         return False
     shares = _shares([row["cpu_s"] for row in rows], n_cores())
-    ready: list[None] = []
-
-    def tell() -> None:
-        """Report one more compiled kernel."""
-        ready.append(None)
-        progress(len(ready), len(rows), COMPILING)
-
+    ready = count(1)
     progress(0, len(rows), COMPILING)
-    whole = _Compilers(animal, shares).run(tell)
+    whole = _compile(animal, shares, lambda: progress(next(ready), len(rows), COMPILING))
     if whole:
         with suppress(OSError):
             done.touch()
@@ -79,51 +72,46 @@ def _shares(costs: Sequence[float], n: int) -> list[list[int]]:
     return [share for share in shares if share]
 
 
-class _Compilers:
-    """Processes that compile the rows of a list, each its share.
+def _compile(animal: str, shares: Sequence[Sequence[int]], report: Callable[[], None]) -> bool:
+    """Compile the rows of a list, each share in a process; reports each kernel.
 
-    They are started with their own command instead of `multiprocessing`, which would run the main
-    script of a caller of `run_session` again in each of them.
+    The processes are started with their own command instead of `multiprocessing`, which would run
+    the main script of a caller of `run_session` again in each of them.
+
+    Returns:
+        Whether all succeeded; False if there is too little memory or too many processes.
     """
+    running: list[subprocess.Popen[str]] = []
 
-    def __init__(self, animal: str, shares: Sequence[Sequence[int]]) -> None:
-        self._commands = [own_python("-m", __name__, animal, *map(str, share)) for share in shares]
-        self._running: list[subprocess.Popen[str]] = []
-
-    def run(self, tell: Callable[[], None]) -> bool:
-        """Wait until all are done; calls `tell` after each kernel and returns whether all
-        succeeded.
-        """
-        try:
-            for command in self._commands:
-                self._running.append(
-                    subprocess.Popen(
-                        command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-                    )
-                )
-            with ThreadPoolExecutor(len(self._running)) as listeners:
-                try:
-                    return all(list(listeners.map(lambda one: _listen(one, tell), self._running)))
-                finally:
-                    self._end()  # before waiting for the listeners
-        except OSError:  # too little memory or too many processes: the run compiles on call
-            return False
-        finally:
-            self._end()
-
-    def _end(self) -> None:
-        """Kill the processes that still run."""
-        for one in self._running:
+    def end() -> None:
+        for one in running:
             one.kill()
             one.wait()
 
+    try:
+        for share in shares:
+            command = own_python("-m", __name__, animal, *map(str, share))
+            quiet = subprocess.DEVNULL
+            running.append(
+                subprocess.Popen(command, stdout=subprocess.PIPE, stderr=quiet, text=True)
+            )
+        with ThreadPoolExecutor(len(running)) as listeners:
+            try:
+                return all(list(listeners.map(partial(_listen, report=report), running)))
+            finally:
+                end()  # before waiting for the listeners
+    except OSError:
+        return False
+    finally:
+        end()
 
-def _listen(process: subprocess.Popen[str], tell: Callable[[], None]) -> bool:
-    """Call `tell` for each line of a process; returns whether it succeeded."""
+
+def _listen(process: subprocess.Popen[str], report: Callable[[], None]) -> bool:
+    """Call `report` for each line of a process; returns whether it succeeded."""
     assert process.stdout is not None
     with process.stdout as lines:
         for _ in lines:
-            tell()
+            report()
     return process.wait() == 0
 
 
@@ -155,10 +143,10 @@ def compile_kernel(row: Mapping[str, Any]) -> None:
 
 
 def type_of(spelled: Any) -> Any:
-    """The numba type of an argument from its `spelling`, a number's type name or a table."""
-    types = _numba_types()
+    """The numba type of an argument as `kernels.json` spells it: a type's name or a table."""
+    types: Any = importlib.import_module("numba.core.types")  # its stubs are incomplete
     if isinstance(spelled, str):
-        return types.none if spelled == "none" else getattr(types, _NUMBERS.get(spelled, spelled))
+        return getattr(types, {"bool": "boolean"}.get(spelled, spelled))
     if "array" in spelled:
         dtype, n_dims, layout, writable = spelled["array"]
         return types.Array(type_of(dtype), n_dims, layout, readonly=not writable)
@@ -169,38 +157,6 @@ def type_of(spelled: Any) -> Any:
         fields = [type_of(field) for field in spelled["fields"]]
         return types.BaseTuple.from_types(fields, getattr(importlib.import_module(module), name))
     return types.BaseTuple.from_types([type_of(field) for field in spelled["tuple"]])
-
-
-_NUMBERS = {"bool": "boolean"}
-
-
-def _numba_types() -> Any:
-    """The module of numba's types; its stubs are incomplete."""
-    return importlib.import_module("numba.core.types")
-
-
-def spelling(kind: Any) -> Any:
-    """How `kernels.json` spells the numba type of an argument.
-
-    Raises:
-        TypeError: it is another kind, such as a function.
-    """
-    types = _numba_types()
-    if isinstance(kind, types.Array):
-        return {"array": [spelling(kind.dtype), kind.ndim, kind.layout, kind.mutable]}
-    if isinstance(kind, types.Omitted):
-        return {"omitted": kind.value}
-    if isinstance(kind, types.NamedTuple | types.NamedUniTuple):
-        owner = kind.instance_class
-        fields = [spelling(field) for field in kind.types]
-        return {"record": f"{owner.__module__}:{owner.__qualname__}", "fields": fields}
-    if isinstance(kind, types.BaseTuple):
-        return {"tuple": [spelling(field) for field in kind.types]}
-    if isinstance(kind, types.Number | types.Boolean | types.NoneType) and not isinstance(
-        kind, types.Literal
-    ):
-        return str(kind)
-    raise TypeError(f"an argument of a kernel should be numbers, arrays or records, not {kind}")
 
 
 def _mark(animal: str, rows: Sequence[Mapping[str, Any]]) -> Path | None:
@@ -215,13 +171,13 @@ def _mark(animal: str, rows: Sequence[Mapping[str, Any]]) -> Path | None:
     folder = getattr(importlib.import_module(module), name).stats.cache_path
     if folder is None:
         return None
-    told = hashlib.sha256(
+    mark = hashlib.sha256(
         f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()} {animal}".encode()
     )
     for path in (KERNELS, *sorted(MODELS.parent.rglob("*.py"))):
         stat = path.stat()
-        told.update(f"{path} {stat.st_mtime_ns} {stat.st_size}\n".encode())
-    return Path(folder) / f"compiled-{told.hexdigest()[:_DIGITS]}"
+        mark.update(f"{path} {stat.st_mtime_ns} {stat.st_size}\n".encode())
+    return Path(folder) / f"compiled-{mark.hexdigest()[:_DIGITS]}"
 
 
 def main() -> None:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,21 +27,16 @@ from numpy.typing import NDArray
 from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.plan import Plan
-from liex_lab.recordings import Recording, open_recording
-from liex_lab.recordings.camera_file import CAMERA_FILE
-from liex_lab.recordings.frame import whole_steps
-from liex_lab.recordings.writer import STAMPS, PictureFolderWriter, RecordingWriter
-from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.places import inside
+from liex_lab.recordings import Recording, camera_file, open_recording
+from liex_lab.recordings.formats.messages.statements import SUFFIX, PackFacts, hash_note
+from liex_lab.recordings.frame import Depth, region_mask, whole_steps
+from liex_lab.recordings.writer import STAMPS, McapDepthWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.runtime import durable, places
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene.zones import Corners
+from liex_lab.tracking.tracker import FrameTracker
 
-from .build import build_recording, build_tracker, open_planned
-
-if TYPE_CHECKING:
-    from liex_lab.recordings.frame import Depth
-    from liex_lab.scene.zones import Corners
-    from liex_lab.tracking.tracker import FrameTracker
-
+from .build import build_recording, build_tracker, open_planned, stated_corners
 
 _STEPS_MM = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)
 _N_PROBED = 8
@@ -135,8 +130,6 @@ def _writer(
             "--ros"
         )
     if _is_mcap(target):
-        from liex_lab.recordings.writer import McapDepthWriter
-
         if step_mm is not None:
             raise RecordingError(
                 "an .mcap file keeps depth as it is, so that --step-mm (in Python step_mm=) says "
@@ -149,7 +142,13 @@ def _writer(
         return McapDepthWriter(
             part, camera, messages="ros" if ros else "foxglove", metadata=metadata
         )
-    step = _step(recording, target) if step_mm is None else step_mm
+    step = largest_step(recording) if step_mm is None else step_mm
+    if step is None:
+        raise RecordingError(
+            f"the depths of {recording.name} are no whole steps of {_STEPS_MM[-1]:g} mm, and "
+            f"{target.name} would hold 16-bit images, which do not keep them; write an .mcap file, "
+            "which does, or let them be rounded with --step-mm 0.1 (in Python step_mm=0.1)"
+        )
     return PictureFolderWriter(
         part, camera, step_mm=step, exact=step_mm is None, metadata=recording.metadata
     )
@@ -170,18 +169,6 @@ def largest_step(recording: Recording) -> float | None:
     return 1.0 if max(float(depth.max()) for depth in depths) > 65535.0 else None
 
 
-def _step(recording: Recording, target: Path) -> float:
-    """The step, mm, of a target's 16-bit images."""
-    step = largest_step(recording)
-    if step is not None:
-        return step
-    raise RecordingError(
-        f"the depths of {recording.name} are no whole steps of {_STEPS_MM[-1]:g} mm, and "
-        f"{target.name} would hold 16-bit pictures, which do not keep them; write an .mcap file, "
-        "which does, or let them be rounded with --step-mm 0.1 (in Python step_mm=0.1)"
-    )
-
-
 def _check_target(target: Path, overwrite: bool) -> None:
     """Refuse other kinds of targets, folders with other files, and existing ones unless
     `overwrite`.
@@ -200,11 +187,12 @@ def _check_target(target: Path, overwrite: bool) -> None:
     is_file = _is_mcap(target)
     if target.is_dir() if is_file else not target.is_dir():
         raise RecordingError(f"{target} is a {'folder' if is_file else 'file'}; give another name")
-    others = (
-        []
-        if is_file
-        else [path.name for path in sorted(target.iterdir()) if not _written_here(path)]
-    )
+    own = {camera_file.CAMERA_FILE, STAMPS}
+    others = [
+        path.name
+        for path in ([] if is_file else sorted(target.iterdir()))
+        if not path.is_file() or not (path.name in own or _PICTURE.fullmatch(path.name))
+    ]
     if others:
         raise RecordingError(
             f"{target} holds more than a recording written by liex convert, such as {others[0]}; "
@@ -217,12 +205,6 @@ def _check_target(target: Path, overwrite: bool) -> None:
         )
 
 
-def _written_here(path: Path) -> bool:
-    return path.is_file() and (
-        path.name in (CAMERA_FILE, STAMPS) or _PICTURE.fullmatch(path.name) is not None
-    )
-
-
 @contextmanager
 def in_place(target: Path) -> Iterator[Path]:
     """Yield a temporary path; rename it to `target` on success, remove it on failure.
@@ -231,7 +213,7 @@ def in_place(target: Path) -> Iterator[Path]:
         RecordingError: it cannot be written.
     """
     try:
-        with replacing(target, replace_folder=True) as part:
+        with durable.replacing(target, replace_folder=True) as part:
             yield part
     except OSError as error:
         raise RecordingError(
@@ -323,7 +305,8 @@ def pack(
                 "would change them; keep the recording, or write it with `liex convert --to "
                 f"{opened.name}.mcap`"
             )
-        corners = () if whole else _stated(opened, plan)
+        region = None if whole else plan.arena.region
+        corners = () if region is None else stated_corners(opened, plan, region)
         mask, notes = (None, []) if whole else _region(recording, opened, plan, corners, progress)
         with in_place(target) as part:
             digest = _write(opened, part, step_mm, mask, corners, progress)
@@ -348,10 +331,13 @@ def pack(
 def _checked(path: str | Path, opened: Recording, progress: Progress) -> Packed:
     """Check times and images of an archive against its stated hash."""
     stated = opened.metadata["packed"]
-    digest = _hash_of(opened, progress)
-    if digest != stated["depth_sha256"]:
+    whole = hashlib.sha256()
+    for frame in opened:
+        _hash_frame(whole, stated["step_mm"], frame.time_ns, frame.depth)
+        progress(frame.index + 1, len(opened), f"verifying {opened.name}")
+    if whole.hexdigest() != stated["depth_sha256"]:
         raise RecordingError(
-            f"{path} was cut or changed since it was packed: its times and pictures have another "
+            f"{path} was cut or changed since it was packed: its times and images have another "
             "hash than it states; take another copy of it"
         )
     size = Path(path).stat().st_size
@@ -362,10 +348,8 @@ def _target(
     recording: str | Path, to: str | Path | None, opened: Recording, overwrite: bool
 ) -> Path:
     """Path of the archive."""
-    from liex_lab.recordings.formats.messages.statements import SUFFIX
-
     beside = Path(recording).parent if opened.sources else Path()
-    target = Path(to) if to is not None else inside(beside, opened.name, f"{SUFFIX}.mcap")
+    target = Path(to) if to is not None else places.inside(beside, opened.name, f"{SUFFIX}.mcap")
     if target.suffix.lower() != ".mcap":
         raise RecordingError(
             f"an archive is an MCAP file; give --to NAME.mcap (in Python to=), not {target.name}"
@@ -403,24 +387,22 @@ def _region(
 
     A found region is kept if the tracker learned from it equals the one learned from whole images.
     """
-    from liex_lab.recordings.frame import region_mask
-
     if corners:
         return region_mask(corners, opened.width, opened.height), []
     if plan.arenas is not None:
-        return None, ["whole pictures are kept, for the plan has several arenas in them"]
+        return None, ["whole images are kept, for the plan has several arenas in them"]
     try:
         seen = build_recording(recording, plan, progress)
     except LiexError as error:
-        return None, [f"whole pictures are kept: {error}"]
+        return None, [f"whole images are kept: {error}"]
     with seen:
         if seen.optics:
-            return None, ["whole pictures are kept, for lens, water or a mirror bend them"]
+            return None, ["whole images are kept, for lens, water or a mirror bend them"]
         progress(0, None, "finding the arena")
         try:
             learned = build_tracker(seen, plan)
         except (EstimationError, ModelError) as error:
-            return None, [f"whole pictures are kept, for no arena was found: {error}"]
+            return None, [f"whole images are kept, for no arena was found: {error}"]
         region = _found_region(learned, seen.width, seen.height)
         if region is None:
             return None, [
@@ -429,7 +411,7 @@ def _region(
             ]
         if learned.scene.support_plane.n_together > 1:  # type: ignore[attr-defined]
             return None, [
-                "whole pictures are kept, for more than one thing moves in them; name what is to "
+                "whole images are kept, for more than one object moves in them; name what is to "
                 "be kept with --region"
             ]
         for share in _WIDER:
@@ -441,16 +423,9 @@ def _region(
             except EstimationError:
                 continue
         return None, [
-            "whole pictures are kept, for the arena alone would be measured otherwise; name the "
+            "whole images are kept, for the arena alone would be measured otherwise; name the "
             "region to be kept with --region"
         ]
-
-
-def _stated(opened: Recording, plan: Plan) -> Corners:
-    """The corners (u, v) px of the plan's region in the recording's images; () if not stated."""
-    from .regions import stated_corners
-
-    return () if plan.arena.region is None else stated_corners(opened, plan, plan.arena.region)
 
 
 def _found_region(tracker: FrameTracker, width: int, height: int) -> Mask | None:
@@ -508,9 +483,6 @@ def _write(
     progress: Progress,
 ) -> str:
     """Write the archive; returns the hash of its times and depths."""
-    from liex_lab.recordings.formats.messages.statements import PackFacts, hash_note
-    from liex_lab.recordings.writer import McapDepthWriter
-
     within = _within(mask)
     moved = opened.stamp_faults
     facts = PackFacts(
@@ -567,11 +539,3 @@ def _hash_frame(whole: hashlib._Hash, step_mm: float, time_ns: int, depth: Depth
     steps = np.rint(depth / np.float32(step_mm)).astype("<u2")
     whole.update(np.int64(time_ns).astype("<i8").tobytes())
     whole.update(steps.tobytes())
-
-
-def _hash_of(opened: Recording, progress: Progress) -> str:
-    whole = hashlib.sha256()
-    for frame in opened:
-        _hash_frame(whole, opened.metadata["packed"]["step_mm"], frame.time_ns, frame.depth)
-        progress(frame.index + 1, len(opened), f"verifying {opened.name}")
-    return whole.hexdigest()

@@ -8,7 +8,7 @@ replaces the folder as a whole, and its predecessor is removed only once the new
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from liex_lab.dashboards.replay.layouts import replay_blueprint
+from liex_lab.dashboards.report.views import write_views
 from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
@@ -27,38 +29,13 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
-from liex_lab.runtime.durable import locked, put_back, put_in_place
-from liex_lab.runtime.places import unlinked, unlinked_tree
+from liex_lab.runtime import durable, places
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions import Session
-from liex_lab.sessions.corrections import (
-    FOLDER,
-    LOG,
-    REPLAY,
-    BoutEdit,
-    Correction,
-    FlipSpan,
-    JointMove,
-    Log,
-    basis,
-    read_log,
-)
-from liex_lab.sessions.evidence import (
-    Results,
-    provenance_of,
-    read_evidence,
-    read_flips,
-    skeleton_of,
-    track_of,
-)
+from liex_lab.sessions import Session, correcting, corrections, evidence, rrd
 from liex_lab.sessions.folder import file_facts
-from liex_lab.sessions.rrd import ReplayWriter
-from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, frame_count
-from liex_lab.tracking.curve import MARGIN, track_whole
-from liex_lab.tracking.observations import reversed_pose
-from liex_lab.tracking.smoother import let_follow
+from liex_lab.tracking import curve, observations, smoother
 from liex_lab.tracking.track import COLUMNS, CORRECTED, Flip, Track, ends_of
 
 from .session import measure_behaviour
@@ -72,47 +49,45 @@ _HELD = 20.0  # weight of a manually placed joint relative to one that may follo
 
 def correct_session(
     session: str | Path,
-    what: Sequence[Correction] = (),
+    what: Sequence[corrections.Correction] = (),
     *,
     undo: Sequence[int] = (),
     author: str = "",
-    blueprint: BlueprintMaker | None = None,
-    report: ReportMaker | None = None,
+    report: bool = True,
     progress: Progress = silent,
 ) -> Path:
-    """Add corrections to a session and undo others; with neither, derive all tables again.
+    """Add corrections to a session, or undo some by number; updates tables and report.
 
-    The change is atomic. Corrections made on an earlier measurement of the recording then apply to
-    this one.
+    The measured data are unchanged; see `liex_lab.sessions.corrections`. Without `what` and `undo`,
+    everything derived from the corrections is regenerated.
 
     Args:
         session: the session folder.
-        what: corrections to add.
-        undo: numbers of corrections to undo, or of an undo to redo (`Log.redoable`).
-        author: author of the corrections.
-        blueprint: makes the layout of the corrected replay, see `SessionWriter`.
-        report: makes the report again, see `SessionWriter`; None leaves it.
-        progress: called with the current stage.
+        what: corrections made by the functions of `liex_lab.sessions.correcting`.
+        undo: numbers of corrections to undo.
+        author: author of the corrections; "" uses the current account.
+        report: whether to regenerate report and figures; for a series of corrections, the last call
+            is enough.
+        progress: receives progress reports.
 
     Returns:
         The session folder.
 
     Raises:
-        SessionError: a correction cannot be applied, no correction exists, those of the log were
-            made on another measurement, or another program corrects the session.
+        SessionError: a correction cannot be applied, or another program is correcting the session.
     """
     raw = Session.open(session, raw=True)
-    with locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
-        folder = unlinked_tree(raw.path / FOLDER)
-        aside = unlinked(raw.path / f"{FOLDER}.old")
-        put_back(folder, aside)  # a process may have been killed here
-        made_of = basis(raw.path, raw.metadata)
-        log = read_log(raw.path)
+    with durable.locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
+        folder = places.unlinked_tree(raw.path / corrections.FOLDER)
+        aside = places.unlinked(raw.path / f"{corrections.FOLDER}.old")
+        durable.put_back(folder, aside)  # a process may have been killed here
+        made_of = corrections.basis(raw.path, raw.metadata)
+        log = corrections.read_log(raw.path)
         if log.touched and log.made_of != made_of and (what or undo):
             raise SessionError(
                 f"the corrections of {raw.path} were made on another measurement of this "
                 "recording; look at them with `liex correct list`, then apply them with `liex "
-                f"correct apply`, or remove the folder {FOLDER}"
+                f"correct apply`, or remove the folder {corrections.FOLDER}"
             )
         log = replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
         if not log.entries:
@@ -120,38 +95,68 @@ def correct_session(
                 f"{raw.path} has no corrections to apply; `liex correct --help` says how to make "
                 "one"
             )
-        part = unlinked(raw.path / f"{FOLDER}.part")
+        part = places.unlinked(raw.path / f"{corrections.FOLDER}.part")
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         try:
             if log.touched:
                 progress(0, None, "measuring what was corrected")
-                log = _apply(raw, log, part, blueprint)
+                log = _apply(raw, log, part)
             if log.described:
                 log = _describe(raw, log, part)
-            (part / LOG).write_text(log.to_json(), encoding="utf-8")
-            put_in_place(part, folder, aside)
+            (part / corrections.LOG).write_text(log.to_json(), encoding="utf-8")
+            durable.put_in_place(part, folder, aside)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-    if report is not None:
+    if report:
         progress(0, None, "writing the report")
-        report(raw.path)
+        write_views(raw.path)
     return raw.path
 
 
-def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | None) -> Log:
+def describe_session(
+    session: str | Path,
+    facts: Mapping[str, str],
+    *,
+    author: str = "",
+    progress: Progress = silent,
+) -> Path:
+    """Set facts about the animal of a session; updates table `sessions` and the report.
+
+    Nothing is measured again. The facts are part of the log of corrections and can be undone.
+
+    Args:
+        session: the session folder.
+        facts: any of subject_id, group, cage, sex, batch, species (Latin), age (12 weeks, or P12W)
+            and session_start_time (ISO 8601 with a time zone); an empty text means unknown.
+        author: author of the change; "" uses the current account.
+        progress: receives progress reports.
+
+    Returns:
+        The session folder.
+
+    Raises:
+        SessionError: there is no such fact, or another program is correcting the session.
+        PlanError: a value is invalid.
+    """
+    return correct_session(
+        session, correcting.descriptions(facts), author=author, progress=progress
+    )
+
+
+def _apply(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
     """Write the tables that differ from the session's, and a replay to overlay on the session's.
 
     Returns the log that lists them.
     """
-    skeleton = skeleton_of(raw)
-    origin = provenance_of(raw, skeleton)
+    skeleton = evidence.skeleton_of(raw)
+    origin = evidence.provenance_of(raw, skeleton)
     found = corrected_track(raw, log, skeleton)
     index = raw.frames["frame_index"].to_numpy()
     rows = Rows(
         found.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
     )
-    results = Results(origin, rows, found.flips)
+    results = evidence.Results(origin, rows, found.flips)
     behaviour, facts = _behaviour(raw, log, found, results)
     written = behaviour.tables
     if found.changed:
@@ -160,27 +165,28 @@ def _apply(raw: Session, log: Log, folder: Path, blueprint: BlueprintMaker | Non
     else:
         written = {name: table for name, table in written.items() if name not in _AS_BEFORE}
     results.write_measured(folder, written, behaviour.vocabulary.columns)
-    facts |= {"corrections": _told(log), "actions": dict(behaviour.actions)}
-    replay = folder / REPLAY
-    made = blueprint({**raw.metadata, **facts}) if blueprint is not None else None
-    ReplayWriter(replay, origin, made, corrected=True).finish(
+    facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}
+    layout = replay_blueprint({**raw.metadata, **facts})
+    rrd.ReplayWriter(folder / corrections.REPLAY, origin, layout, corrected=True).finish(
         rows, behaviour.kinematics, behaviour.bouts, list(behaviour.actions), ()
     )
     return replace(log, files=file_facts(folder), facts=facts)
 
 
-def _describe(raw: Session, log: Log, folder: Path) -> Log:
+def _describe(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
     """Write the table `sessions` with the corrected description; returns the log with this file."""
     path = folder / "sessions.parquet"
     table = pd.read_parquet(path) if path.is_file() else raw.table("sessions")
-    said = {key: value for key, value in log.described.items() if key in table}
-    metadata = provenance_of(raw, skeleton_of(raw)).table_metadata()
-    schema.write_table(path, schema.SESSIONS, schema.from_pandas(table.assign(**said)), metadata)
+    described = {key: value for key, value in log.described.items() if key in table}
+    metadata = evidence.provenance_of(raw, evidence.skeleton_of(raw)).table_metadata()
+    schema.write_table(
+        path, schema.SESSIONS, schema.from_pandas(table.assign(**described)), metadata
+    )
     kept = {name: facts for name, facts in log.files.items() if name != path.name}
     return replace(log, files={**kept, path.name: file_facts(folder)[path.name]})
 
 
-def _told(log: Log) -> dict[str, Any]:
+def _summary(log: corrections.Log) -> dict[str, Any]:
     """Summary of the active corrections for session.json: numbers by kind, authors, last time."""
     made = [(entry.what, entry.author) for entry in log.touched if entry.what is not None]
     kinds = {kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")}
@@ -193,7 +199,7 @@ def _told(log: Log) -> dict[str, Any]:
 
 
 def _behaviour(
-    raw: Session, log: Log, found: CorrectedTrack, results: Results
+    raw: Session, log: corrections.Log, found: CorrectedTrack, results: evidence.Results
 ) -> tuple[Behaviour, dict[str, Any]]:
     """The behaviour of the corrected track, and facts about it for session.json.
 
@@ -216,7 +222,7 @@ def _behaviour(
         )
         bouts = spliced_bouts(bouts, again.bouts, found.turned, frames)
         actions = {**again.actions, **actions}
-    bouts = edited_bouts(bouts, log.corrections(BoutEdit), frames)
+    bouts = edited_bouts(bouts, log.corrections(corrections.BoutEdit), frames)
     return measure_rows(results.rows, rules, around, bouts=bouts, actions=actions), facts
 
 
@@ -247,7 +253,7 @@ class CorrectedTrack:
         return bool(len(self.turned) + len(self.moved))
 
 
-def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> CorrectedTrack:
+def corrected_track(session: Session, log: corrections.Log, skeleton: Skeleton) -> CorrectedTrack:
     """Track of a session with the active corrections of its log.
 
     Args:
@@ -259,32 +265,32 @@ def corrected_track(session: Session, log: Log, skeleton: Skeleton) -> Corrected
         SessionError: the session has no observations to rebuild the track from, or a joint was
             moved in a frame that has no pose.
     """
-    track = track_of(session, skeleton)
+    track = evidence.track_of(session, skeleton)
     index = session.frames["frame_index"].to_numpy(np.int64)
-    flips = tuple(read_flips(session))
+    flips = tuple(evidence.read_flips(session))
     turned = np.zeros(0, np.int64)
-    spans: list[FlipSpan] = log.corrections(FlipSpan)
+    spans: list[corrections.FlipSpan] = log.corrections(corrections.FlipSpan)
     if spans:
         track, flips, turned = _turned_round(session, track, index, spans)
     moves = _moves_of(log, skeleton)
     was = deepcopy(track.pose)
     moved = place_joints(track, index, moves, session.camera, session.T_arena_camera)
     if len(moved):
-        followed = let_follow(track, was, moved)
+        followed = smoother.let_follow(track, was, moved)
         track.uv_px[followed] = session.camera.project(
             session.T_arena_camera.inverse() @ track.joints_mm[followed]
         )
     return CorrectedTrack(track, turned, moved, flips)
 
 
-def _moves_of(log: Log, skeleton: Skeleton) -> list[JointMove]:
+def _moves_of(log: corrections.Log, skeleton: Skeleton) -> list[corrections.JointMove]:
     """The active moves; a later exchange of head and tail in their frame mirrors the joint."""
     names = list(skeleton.names)
-    moves: list[JointMove] = []
+    moves: list[corrections.JointMove] = []
     for one in (entry.what for entry in log.standing):
-        if isinstance(one, JointMove):
+        if isinstance(one, corrections.JointMove):
             moves.append(one)
-        elif isinstance(one, FlipSpan):
+        elif isinstance(one, corrections.FlipSpan):
             moves = [
                 replace(move, joint=names[-1 - names.index(move.joint)])
                 if one.start_frame <= move.frame < one.stop_frame
@@ -295,7 +301,7 @@ def _moves_of(log: Log, skeleton: Skeleton) -> list[JointMove]:
 
 
 def _turned_round(
-    session: Session, track: Track, index: Numbers, spans: Sequence[FlipSpan]
+    session: Session, track: Track, index: Numbers, spans: Sequence[corrections.FlipSpan]
 ) -> tuple[Track, tuple[Flip, ...], Numbers]:
     """Rebuild the track from the observations with head and tail exchanged in the spans.
 
@@ -303,19 +309,19 @@ def _turned_round(
     agrees with its neighbour: there the smoothed curve was bent by the half turn that is gone. No
     row loses its pose or its trust.
     """
-    seen, subject = read_evidence(session)
+    seen, subject = evidence.read_evidence(session)
     rows_of_spans = (np.searchsorted(index, (one.start_frame, one.stop_frame)) for one in spans)
     wanted = [Flip(int(start), int(stop), 1.0, True, HUMAN) for start, stop in rows_of_spans]
     # from versions that wrote into the table
-    earlier = [flip for flip in read_flips(session) if flip.source == HUMAN]
-    again = track_whole(subject, seen, [*earlier, *wanted])
+    earlier = [flip for flip in evidence.read_flips(session) if flip.source == HUMAN]
+    again = curve.track_whole(subject, seen, [*earlier, *wanted])
     ends = ends_of((flip.start, flip.stop) for flip in wanted)
     exchanged = np.cumsum(np.bincount(ends, minlength=len(index) + 1))[:-1] % 2 == 1
     near = exchanged.copy()
     parts = [0, *again.cuts, len(index)]
     for end in set(ends) - set(parts):
         k = int(np.searchsorted(parts, end))
-        near[max(parts[k - 1], end - MARGIN) : min(parts[k], end + MARGIN)] = True
+        near[max(parts[k - 1], end - curve.MARGIN) : min(parts[k], end + curve.MARGIN)] = True
     was, now = (
         one.joints_mm[:, one.skeleton.tip] - one.joints_mm[:, 0] for one in (track, again.track)
     )
@@ -329,7 +335,7 @@ def _turned_round(
         getattr(track, name)[near & ~lost] = getattr(again.track, name)[near & ~lost]
     track.flag[trusted] = ""
     rows = np.flatnonzero(lost & exchanged)
-    turned = reversed_pose(track.skeleton, track.pose[rows])
+    turned = observations.reversed_pose(track.skeleton, track.pose[rows])
     _put(track, rows, turned, session.camera, session.T_arena_camera)
     return track, again.flips, np.flatnonzero(near)
 
@@ -341,7 +347,11 @@ def _put(track: Track, rows: Numbers, pose: Pose, camera: Camera, T_arena_camera
 
 
 def place_joints(
-    track: Track, index: Numbers, moves: Sequence[JointMove], camera: Camera, T_arena_camera: SE3
+    track: Track,
+    index: Numbers,
+    moves: Sequence[corrections.JointMove],
+    camera: Camera,
+    T_arena_camera: SE3,
 ) -> Numbers:
     """Move joints to manually chosen positions, in place, and let the others follow.
 
@@ -395,7 +405,7 @@ def place_joints(
 
 
 def edited_bouts(
-    bouts: pd.DataFrame, edits: Iterable[BoutEdit], frames: pd.DataFrame
+    bouts: pd.DataFrame, edits: Iterable[corrections.BoutEdit], frames: pd.DataFrame
 ) -> pd.DataFrame:
     """Ethogram with manual edits applied in order.
 
@@ -416,8 +426,8 @@ def edited_bouts(
             _cleared(rows, edit.was_start_ns, edit.was_stop_ns), edit.start_ns, edit.stop_ns
         )
         if edit.action:
-            said = {"action": edit.action, "score": 1.0, "source": HUMAN, "model_hash": ""}
-            rows.append({**said, "start_ns": edit.start_ns, "stop_ns": edit.stop_ns})
+            edited = {"action": edit.action, "score": 1.0, "source": HUMAN, "model_hash": ""}
+            rows.append({**edited, "start_ns": edit.start_ns, "stop_ns": edit.stop_ns})
     return _table(rows, frames)
 
 

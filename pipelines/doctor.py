@@ -18,40 +18,54 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import (
+    EstimationError,
     LiexError,
+    PlanError,
     SeveralKindsError,
     UnknownCameraError,
     UnknownTimesError,
     printable,
 )
-from liex_lab.optics.camera import SensorCard, of_size, preset, unusual_centre, unusual_lens
-from liex_lab.plan import Plan
+from liex_lab.optics import camera, refraction
+from liex_lab.plan import Plan, sections
 from liex_lab.plan.plan import arena_lines
-from liex_lab.plan.sections import SeveralArenas
+from liex_lab.recordings import rectify, timestamps
 from liex_lab.recordings.frame import PLAUSIBLE_MM
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.rectify import rectified
-from liex_lab.recordings.timestamps import (
-    DROPPED,
-    Gap,
-    frames_apart,
-    median_step,
-    unwritable_times,
-)
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_toml
-from liex_lab.scene.background import has_noise, sample_frames, sampled, stride_for
-from liex_lab.scene.scene import Arena, Fixture
+from liex_lab.scene import background_segmenter, support_plane
+from liex_lab.scene.background import (
+    has_noise,
+    sample_frames,
+    sampled,
+    sampled_scene,
+    stride_for,
+)
+from liex_lab.scene.floor import Floor, floor_patch
+from liex_lab.scene.learning import learn_scene
+from liex_lab.scene.scene import Arena, Fixture, find_arena
 from liex_lab.scene.zones import masks_apart
 from liex_lab.sessions.folder import megabytes
 from liex_lab.tracking.curve import repeat_messages
 
-from .build import build_water, open_planned
+from .build import (
+    animal_of,
+    arenas_of,
+    build_water,
+    build_zones,
+    cut_out,
+    open_planned,
+    propose_arenas,
+    region_of,
+    session_bytes,
+    stated_corners,
+    stated_floor,
+    target_of,
+)
 from .choice import USUAL, Proposal, propose_plan
-from .doctor_scene import SceneLook
-from .origin import animal_of, session_bytes
-from .regions import arenas_of, cut_out, propose_arenas, stated_corners
 
 _USUAL_HZ = 30.0
 _USUAL_FOCAL = 0.9  # of the image's width: depth cameras have a field of view of 55 to 65 degrees
@@ -88,16 +102,16 @@ def open_anyhow(
             guessed = guessed.with_settings(_GUESS)
         except UnknownTimesError:
             missing.append(
-                f"the times of the pictures are not known, and {_USUAL_HZ:g} frames/s were assumed "
+                f"the images have no timestamps, and {_USUAL_HZ:g} frames/s were assumed "
                 f"here; write fps = {_USUAL_HZ:g} (your camera's rate) under [camera] in "
-                "camera.toml, or timestamps.csv with a line time_ns and then one time per picture"
+                "camera.toml, or timestamps.csv with a line time_ns and then one time per image"
             )
             guessed = guessed.with_settings([f"recording.fps={_USUAL_HZ}"])
         except SeveralKindsError as error:
             pattern = error.pattern
             missing.append(
-                f"pictures of several kinds lie here, and {pattern} was looked at; choose with the "
-                f'line pattern = "{pattern}" under [camera] in camera.toml'
+                f"the folder holds images of several kinds, and {pattern} was inspected; choose "
+                f'with the line pattern = "{pattern}" under [camera] in camera.toml'
             )
         else:
             break
@@ -112,15 +126,15 @@ def _guess_camera(recording: Recording) -> str:
     """Set the likeliest camera for the recording's image size; returns what to write."""
     width = recording.width
     height = recording.height
-    names = of_size(width, height)
-    focal = preset(names[0], width, height).fx if names else round(_USUAL_FOCAL * width, 1)
+    names = camera.of_size(width, height)
+    focal = camera.preset(names[0], width, height).fx if names else round(_USUAL_FOCAL * width, 1)
     like = f"those of a {names[0]}" if names else "those of many a depth camera"
     cx = (width - 1) / 2
     cy = (height - 1) / 2
     recording.camera = replace(
         recording.camera, fx=focal, fy=focal, cx=cx, cy=cy, source="assumed: not stated"
     )
-    choice = f"say --set camera.preset={'|'.join(names)}, or " if names else ""
+    choice = f"use --set camera.preset={'|'.join(names)}, or " if names else ""
     return (
         f"the camera is not known, so all lengths here are guesses with {like}; {choice}write "
         f"camera.toml with the lines [camera], fx = {focal:g}, fy = {focal:g}, cx = {cx:g}, "
@@ -147,7 +161,7 @@ def next_command(
         plan: the given plan, as typed; None if none was given.
         options: further given options that a run accepts too.
     """
-    if not proposal.says:
+    if not proposal.summary:
         return ""
     where = shlex.quote(str(path))
     if missing or proposal.plan is None:
@@ -155,7 +169,7 @@ def next_command(
         again = f"liex doctor {where} {given}".rstrip()
         if missing:
             return f"write what is missing, then {again}"
-        return f"{again} again, once what is said above is corrected"
+        return f"{again} again, once the problems above are corrected"
     named = plan if plan and proposal.is_given else proposal.plan
     chosen = ["--plan", named] if plan or named != USUAL else []
     several = ["--set", "arenas=auto"] if n_arenas > 1 else []
@@ -185,121 +199,120 @@ def examine(
 ) -> dict[str, Any]:
     """The findings of a recording: the keys of `FINDINGS`, in JSON's types.
 
-    A recording that is cut short is inspected as far as it can be read. Missing camera or times are
-    guessed, and the report lists the lines that state them.
+    Of a cut recording, all whole frames count. Missing camera or times are guessed and listed.
 
     Args:
         path: a file, folder or address of a recording.
         plan: camera, water surface, expected sizes; None uses the default plan.
         fps: frame rate of recordings without stamps, before the plan's.
         topic: depth topic of a message log, before the plan's.
-        propose: check which bundled plan fits, which needs their models: the given or the usual one
-            first, others only if it does not fit.
+        propose: check which bundled plan fits, which needs their models.
         named: whether the user named the plan; if so, the report states when it does not fit.
         typed: the plan as typed, None if absent, and further options for the run.
         progress: called while an archive is unpacked or an index made.
-
-    Raises:
-        RecordingError: the recording cannot be opened at all.
     """
     asked = plan if named else None
-    plan = _asked(plan or Plan(), fps, topic)
+    stated = {"fps": fps, "topic": topic, "accept_truncated": "true"}
+    settings = [f"recording.{key}={value}" for key, value in stated.items() if value is not None]
+    plan = (plan or Plan()).with_settings(settings)
     water = build_water(plan)
     recording, missing = open_anyhow(path, plan, progress)
     with recording as opened:
-        progress(0, None, "looking at frames spread over the recording")
-        seen = rectified(opened, water)
+        progress(0, None, "inspecting frames spread over the recording")
+        ideal = rectify.rectified(opened, water)
         misplaced: list[str] = []
         try:
-            seen = cut_out(seen, plan)
+            ideal = cut_out(ideal, plan)
         except LiexError as error:
             misplaced.append(str(error))
             plan = plan.with_settings(["arena.region="])
-        stride = stride_for(seen, animal_of(plan).spine_min_mm)
-        sample = sample_frames(seen, _N_SAMPLED, stride)
-        depth = _Depths(sample if seen is opened else sample_frames(opened, _N_RAW))
-        scene = SceneLook(seen, plan, water, sample, stride)
-        if depth.median_mm is not None:
-            scene.at_scene()
+        stride = stride_for(ideal, animal_of(plan).spine_min_mm)
+        sample = sample_frames(ideal, _N_SAMPLED, stride)
+        raw = sample if ideal is opened else sample_frames(opened, _N_RAW)
+        facts, unlikely, median_mm = _depth_facts(raw)
+        scene: list[str] = []
+        arenas: list[sections.SeveralArenas] = []
         proposal = Proposal(None, "")
-        arenas: list[SeveralArenas] = []
-        if depth.median_mm is not None and (propose or plan.arenas is not None):
-            progress(0, None, "looking for several arenas")
-            arenas = _several(seen, plan, misplaced)
-        if propose and depth.median_mm is not None:
-            progress(0, None, "looking which plan fits")
-            first = arenas[0] if arenas else None
-            one = (
-                seen
-                if first is None
-                else seen.masked(stated_corners(seen, plan, first.region), lent=True)
-            )
-            proposal = propose_plan(one, asked)
-        lens = opened.camera
-        found = {
-            **_time_facts(opened),
-            **{name: getattr(lens, name) for name in ("width", "height")},
-            **{name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")},
-            "intrinsics_source": lens.source,
-            "distortion": None if lens.distortion is None else lens.distortion.to_dict(),
-            "water": None if water is None else water.to_dict(),
-            **depth.facts(),
-            **scene.facts,
-            "session_mb": _session_mb(seen, plan, scene.facts["animal_length_mm"], depth.median_mm),
-            "arenas": [line for one in arenas for line in arena_lines(one)],
-            "plan": proposal.plan,
-            "plan_says": proposal.says,
-            "n_animals": proposal.n_animals,
-            "missing": missing,
-            "problems": [
-                *seen.problems,
-                *filter(None, [unwritable_times(opened.times_ns)]),
-                *filter(None, [unusual_lens(lens) if water is None and not missing else ""]),
-                *filter(None, [unusual_centre(lens)[0] if not missing else ""]),
-                *_time_problems(opened),
-                *_copies_told(opened, sample),
-                *depth.problems(),
-                *misplaced,
-                *scene.problems,
-                *proposal.problems,
-            ],
-            "next": next_command(
-                path, proposal, missing, len(arenas) if asked is None else 0, *typed
-            ),
-        }
-    return {key: found[key] for key in FINDINGS}
+        if median_mm is not None:
+            found, scene = scene_facts(ideal, plan, water, sample, stride)
+            facts |= found | _session_size(ideal, plan, found.get("animal_length_mm"), median_mm)
+            progress(0, None, "checking which plan fits")
+            if propose or plan.arenas is not None:
+                arenas = _several(ideal, plan, misplaced)
+            if propose:
+                regions = [stated_corners(ideal, plan, one.region) for one in arenas[:1]]
+                first = ideal.masked(regions[0], lent=True) if regions else ideal
+                proposal = propose_plan(first, asked)
+        facts |= _time_facts(opened) | _lens_facts(opened.camera)
+        problems = [
+            *ideal.problems,
+            *filter(None, [timestamps.unwritable_times(opened.times_ns)]),
+            *_lens_problems(opened.camera, water, missing),
+            *_time_problems(opened),
+            *_copies_told(opened, sample),
+            *unlikely,
+            *misplaced,
+            *scene,
+            *proposal.problems,
+        ]
+    n_arenas = len(arenas) if asked is None else 0
+    facts |= {
+        "water": None if water is None else water.to_dict(),
+        "arenas": [line for one in arenas for line in arena_lines(one)],
+        "plan": proposal.plan,
+        "plan_says": proposal.summary,
+        "n_animals": proposal.n_animals,
+        "missing": missing,
+        "problems": problems,
+        "next": next_command(path, proposal, missing, n_arenas, *typed),
+    }
+    return {key: facts.get(key) for key in FINDINGS}
 
 
-def _session_mb(
-    seen: Recording, plan: Plan, length_mm: float | None, distance_mm: float | None
-) -> float | None:
-    """Size of a session on disk, MB; None if no animal is found."""
-    if length_mm is None or distance_mm is None:
-        return None
-    return round(session_bytes(seen, plan, length_mm, distance_mm) / 1e6, 1)
+def _lens_facts(lens: camera.Camera) -> dict[str, Any]:
+    return {
+        **{name: getattr(lens, name) for name in ("width", "height")},
+        **{name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")},
+        "intrinsics_source": lens.source,
+        "distortion": None if lens.distortion is None else lens.distortion.to_dict(),
+    }
 
 
-def _several(seen: Recording, plan: Plan, misplaced: list[str]) -> list[SeveralArenas]:
+def _lens_problems(
+    lens: camera.Camera, water: refraction.Water | None, missing: list[str]
+) -> list[str]:
+    """Sentences on unusual intrinsics, unless they are guessed."""
+    if missing:
+        return []
+    return [
+        text
+        for text in ("" if water else camera.unusual_lens(lens), camera.unusual_centre(lens)[0])
+        if text
+    ]
+
+
+def _session_size(
+    ideal: Recording, plan: Plan, length_mm: float | None, distance_mm: float
+) -> dict[str, float]:
+    """Size of a session on disk, MB; {} if no animal is found."""
+    if length_mm is None:
+        return {}
+    return {"session_mb": round(session_bytes(ideal, plan, length_mm, distance_mm) / 1e6, 1)}
+
+
+def _several(ideal: Recording, plan: Plan, misplaced: list[str]) -> list[sections.SeveralArenas]:
     """Several arenas in an image, listed or proposed; errors in listed ones go to `misplaced`."""
     try:
         if plan.arenas is None:
-            return propose_arenas(seen, plan)
-        found = arenas_of(seen, plan)
-        corners = {one.name: stated_corners(seen, plan, one.region) for one in found}
-        masks_apart(corners, seen.width, seen.height)
+            return propose_arenas(ideal, plan)
+        found = arenas_of(ideal, plan)
+        corners = {one.name: stated_corners(ideal, plan, one.region) for one in found}
+        masks_apart(corners, ideal.width, ideal.height)
     except LiexError as error:
         if plan.arenas is not None:
             misplaced.append(str(error))
         return []
     return found
-
-
-def _asked(plan: Plan, fps: float | None, topic: str | None) -> Plan:
-    """The plan with the command line's settings; a recording that is cut short is accepted."""
-    settings = ["recording.accept_truncated=true"]
-    settings += [f"recording.fps={fps!r}"] if fps is not None else []
-    settings += [f"recording.topic={topic}"] if topic is not None else []
-    return plan.with_settings(settings)
 
 
 def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]:
@@ -319,13 +332,15 @@ def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]
     times_ns, repeats = (np.array(column) for column in zip(*compared, strict=True))
     some = f", of {len(compared):,} frames compared" if len(compared) < n else ""
     found = repeat_messages(times_ns, repeats, has_noise(sample))
-    return [f"{told}{some}" for part in found for told in part]
+    return [f"{sentence}{some}" for part in found for sentence in part]
 
 
 def _time_facts(recording: Recording) -> dict[str, Any]:
     step = np.diff(recording.times_ns) / 1e6
     dropped = _dropped(recording)
-    usual = step[frames_apart(recording.times_ns, median_step(recording.times_ns)) == 1]
+    usual = step[
+        timestamps.frames_apart(recording.times_ns, timestamps.median_step(recording.times_ns)) == 1
+    ]
     return {
         "format": recording.format,
         "n_frames": len(recording),
@@ -338,9 +353,9 @@ def _time_facts(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _dropped(recording: Recording) -> list[Gap]:
+def _dropped(recording: Recording) -> list[timestamps.Gap]:
     """The gaps in which the camera dropped frames while its clock continued."""
-    return [gap for gap in recording.gaps if gap.reason == DROPPED]
+    return [gap for gap in recording.gaps if gap.reason == timestamps.DROPPED]
 
 
 def _time_problems(recording: Recording) -> list[str]:
@@ -367,65 +382,276 @@ def _time_problems(recording: Recording) -> list[str]:
     return found
 
 
-class _Depths:
-    """Depth statistics of the sampled frames, one frame at a time to bound memory."""
-
-    def __init__(self, frames: NDArray[np.float32]) -> None:
-        """Frames (n, H, W) mm as recorded."""
-        self.n_frames = len(frames)
-        self.n_empty = 0
-        self.low = math.inf
-        self.high = 0.0
-        n_unread = 0
-        n_pixels = 0
-        medians = []
-        for frame in frames:
-            read = frame[frame > 0]
-            if not read.size:
-                self.n_empty += 1
-                continue
-            n_unread = n_unread + frame.size - read.size
-            n_pixels = n_pixels + frame.size
-            self.low = min(self.low, float(read.min()))
-            self.high = max(self.high, float(read.max()))
-            medians.append(float(np.median(read)))
-        self.median_mm = float(np.median(medians)) if medians else None
-        self.unread_share = n_unread / n_pixels if n_pixels else 1.0
-
-    def facts(self) -> dict[str, Any]:
-        """The depth part of `FINDINGS`."""
-        known = self.median_mm is not None
-        return {
-            "depth_min_mm": self.low if known else None,
-            "depth_max_mm": self.high if known else None,
-            "unread_share": self.unread_share,
-        }
-
-    def problems(self) -> list[str]:
-        """Sentences about missing or implausible depths."""
-        if self.median_mm is None:
-            return [
-                f"none of the {self.n_frames} frames looked at holds any depth; check the camera "
-                "and unit_mm"
-            ]
-        found = []
-        if self.n_empty:
-            found.append(
-                f"{self.n_empty} of the {self.n_frames} frames looked at hold no depth at all; "
-                "check the camera's cable and what covers its lens"
-            )
-        if not PLAUSIBLE_MM[0] <= self.median_mm <= PLAUSIBLE_MM[1]:
-            found.append(
-                f"the median depth is {self.median_mm:.4g} mm, which no animal is watched from; "
-                "the depths are probably not in mm, so state the true unit_mm (millimetres per "
-                "stored step) in camera.toml"
-            )
-        return found
+def _depth_facts(
+    frames: NDArray[np.float32],
+) -> tuple[dict[str, Any], list[str], float | None]:
+    """Facts and problems of the readings of sampled frames (n, H, W) mm, and their median, mm."""
+    readings = (frame[frame > 0] for frame in frames)
+    known = np.array([(r.size, r.min(), r.max(), np.median(r)) for r in readings if r.size], float)
+    if not len(known):
+        return (
+            {"unread_share": 1.0},
+            [
+                f"none of the {len(frames)} inspected frames has any depth; check the camera and "
+                "unit_mm"
+            ],
+            None,
+        )
+    n_pixels = len(known) * frames[0].size
+    facts = {
+        "depth_min_mm": float(known[:, 1].min()),
+        "depth_max_mm": float(known[:, 2].max()),
+        "unread_share": float((n_pixels - known[:, 0].sum()) / n_pixels),
+    }
+    problems = []
+    if n_empty := len(frames) - len(known):
+        problems.append(
+            f"{n_empty} of the {len(frames)} inspected frames have no depth at all; check the "
+            "camera's cable and what covers its lens"
+        )
+    median_mm = float(np.median(known[:, 3]))
+    if not PLAUSIBLE_MM[0] <= median_mm <= PLAUSIBLE_MM[1]:
+        problems.append(
+            f"the median depth is {median_mm:.4g} mm, which is implausible for an animal; the "
+            "depths are probably not in mm, so state the true unit_mm (millimetres per stored "
+            "step) in camera.toml"
+        )
+    return facts, problems, median_mm
 
 
 def _finite(value: float) -> float | None:
     """The number, or None if JSON cannot represent it."""
     return float(value) if math.isfinite(value) else None
+
+
+# The scene: floor, noise, arena, water and animal in the sampled frames.
+
+
+_LEVEL_RAD = math.radians(3.0)  # largest angle between a tank's floor and its water surface
+_MUCH_UNREAD = 0.2  # share of the pixels on the floor
+_MUCH_NOISE = 0.5  # of the height from which a pixel counts as the animal
+_STILL_SHARE = 0.4  # of the animal's area was in the background
+# sizes outside the plan's range are searched down to and up to this factor
+_WIDER = 20.0
+
+
+def scene_facts(
+    ideal: Recording,
+    plan: Plan,
+    water: refraction.Water | None,
+    sample: NDArray[np.float32],
+    stride: int,
+) -> tuple[dict[str, Any], list[str]]:
+    """Facts and problems of the still background and the animal; without a floor, no facts.
+
+    The floor is a plane fitted to the learned background. The animal is found by background
+    subtraction as in a run, or else among objects up to 20 times smaller or larger.
+
+    Args:
+        ideal: the recording, rectified.
+        plan: expected sizes, thresholds, zones.
+        water: the water surface; None if absent.
+        sample: (n, H, W) float32 depth, mm, of every `stride`-th pixel.
+        stride: image pixels per sample pixel, along an axis.
+    """
+    grid = ideal.camera.every(stride)
+    try:
+        region = region_of(ideal, plan)
+        stated = stated_floor(ideal.camera, plan)
+    except (PlanError, EstimationError) as error:
+        return {}, [str(error)]
+    if region is not None:
+        region = region[::stride, ::stride]
+        sample = sample * region
+    scene = sampled_scene(sample, grid, target_of(plan))
+    background = scene.background
+    try:
+        support = support_plane.find_support_plane(
+            scene, None if stated is None else stated.for_camera(grid)
+        )
+    except EstimationError as error:
+        return {}, [f"no floor: {error}"]
+    if support.region is not None:
+        background = np.where(support.region, background, np.float32(0))
+    facts, problems = _floor_facts(ideal, plan, sample, background, support, grid)
+    lift = None if water is None else water.lift_mm
+    distance = support.floor.lens_distance_mm(lift)
+    facts |= {"floor_mm": distance, "floor_tilt_rad": support.floor.tilt_rad}
+    problems += support.floor.unusual(lift)
+    if water is not None:
+        deep, tilted = _water_depth(water, support.floor, distance)
+        facts["water_depth_mm"] = deep
+        problems += tilted
+    found, doubts = _animal_facts(ideal, plan, sample, background, grid, stated, region)
+    return facts | found, [*problems, *doubts]
+
+
+def _animal_facts(
+    ideal: Recording,
+    plan: Plan,
+    sample: NDArray[np.float32],
+    background: NDArray[np.float32],
+    grid: camera.Camera,
+    stated: Floor | None,
+    region: NDArray[np.bool_] | None,
+) -> tuple[dict[str, Any], list[str]]:
+    """The animal as a run would find it, or else an object of another size that moves.
+
+    Args:
+        ideal: the recording, rectified.
+        plan: expected sizes and thresholds.
+        sample: (n, H, W) depth, mm.
+        background: (H, W) depth, mm, 0 outside the region.
+        grid: camera of the sample.
+        stated: the floor that the plan states.
+        region: (H, W) pixels of the plan's region.
+    """
+    animal = animal_of(plan)
+    sizes = (animal.spine_min_mm, animal.spine_max_mm)
+    min_height_mm = plan.foreground.min_height_mm
+    view = Skeleton.load(animal.skeleton).view
+    memory = Recording(
+        name=ideal.name,
+        format="sample",
+        camera=grid,
+        times_ns=ideal.times_ns[sampled(len(ideal), len(sample))],
+        read=lambda k: sample[k],
+    )
+    missing = ""
+    for wider in (1.0, _WIDER):
+        within = (sizes[0] / wider, sizes[1] * wider)
+        try:
+            scene, frames = learn_scene(
+                memory, within, len(sample), min_height_mm, view, stated, region
+            )
+        except EstimationError as error:
+            missing = missing or str(error)
+            continue
+        if wider != 1.0 and scene.support_plane is not None and not scene.support_plane.moves:
+            continue  # a still object of another size is not an animal
+        crops = scene.extract(frames, 1.0)
+        length = 4.0 * float(np.median(crops.blobs.sd_along[crops.found]))
+        if wider == 1.0:
+            share = float(crops.found.mean())
+            facts, doubts = _size_facts(scene, background, length, share, min_height_mm)
+            return facts | {"scene": scene.described().to_dict()}, [*scene.doubts, *doubts]
+        factor = length / math.sqrt(sizes[0] * sizes[1])
+        missing = (
+            f"what moves is about {length:.0f} mm long, but the plan expects an animal with a "
+            f"spine of {sizes[0]:g} to {sizes[1]:g} mm; if the animal is of that size, the "
+            f"millimetres are wrong by a factor of about {factor:.2g} (check unit_mm and the focal "
+            "lengths), else set animal.spine_min_mm and animal.spine_max_mm or name another --plan"
+        )
+    return {}, [missing]
+
+
+def _floor_facts(
+    ideal: Recording,
+    plan: Plan,
+    sample: NDArray[np.float32],
+    background: NDArray[np.float32],
+    support: support_plane.SupportPlane,
+    grid: camera.Camera,
+) -> tuple[dict[str, Any], list[str]]:
+    """Noise and unread pixels on the floor, the arena's outline, and errors in the zones."""
+    problems = [support.doubt] if support.doubt else []
+    floor = support.floor
+    noise = _noise(sample, floor_patch(background, floor.depth(grid.width, grid.height)))
+    read = [frame[support.on_floor] > 0 for frame in sample if frame.any()]
+    unread = 1.0 - float(np.mean(read))
+    arena = find_arena(background, floor, grid)
+    whole = floor.for_camera(ideal.camera)
+    try:
+        for zone in build_zones(plan):
+            zone.placed(ideal.camera, whole, arena)
+    except PlanError as error:
+        problems.append(str(error))
+    if unread > _MUCH_UNREAD:
+        problems.append(
+            f"{unread:.0%} of the pixels on the floor are unread, more than {_MUCH_UNREAD:.0%}; "
+            "check the camera's range, sunlight, and surfaces that shine or swallow infrared light"
+        )
+    least = plan.foreground.min_height_mm
+    if noise is not None and noise > _MUCH_NOISE * least:
+        problems.append(
+            f"the floor's depth varies by {noise:.1f} mm from frame to frame, and a pixel counts "
+            f"as the animal from {least:g} mm above it; bring the camera nearer, keep sunlight "
+            "out, or raise foreground.min_height_mm"
+        )
+    facts = {"noise_mm": noise, "floor_unread_share": unread, "arena": arena.to_dict()}
+    return facts, problems
+
+
+def _water_depth(
+    water: refraction.Water, floor: Floor, distance_mm: float
+) -> tuple[float, list[str]]:
+    """Depth of the water below the lens, mm, and whether its surface contradicts the floor."""
+    cosine = float(floor.normal @ water.normal)
+    deep = distance_mm / cosine - water.height_mm
+    if deep <= 0:
+        return deep, [
+            f"the plan puts the water's surface {water.height_mm:.0f} mm below the lens, but the "
+            "floor is not below it; measure water.height_mm again, or leave it out if there is no "
+            "water"
+        ]
+    angle = math.acos(min(1.0, cosine))
+    if angle <= _LEVEL_RAD:
+        return deep, []
+    tilts = np.arctan2(-floor.normal[:2], floor.normal[2])
+    return deep, [
+        f"the floor is tilted by {math.degrees(angle):.1f} degrees against the water's surface; if "
+        f"the tank's floor is level, the camera is tilted: set water.tilt_x_rad={tilts[0]:.3f} and "
+        f"water.tilt_y_rad={tilts[1]:.3f}, and look again"
+    ]
+
+
+def _size_facts(
+    scene: background_segmenter.BackgroundSubtraction,
+    background: NDArray[np.float32],
+    length: float,
+    share: float,
+    min_height_mm: float,
+) -> tuple[dict[str, Any], list[str]]:
+    """The animal's size, and how often and where it is found."""
+    raised = scene.background - background[:: scene.stride, :: scene.stride]
+    covered = scene.on_floor & (raised > min_height_mm) & (raised < scene.background)
+    area = float(
+        (scene.background[covered].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy)
+    )
+    still = area > _STILL_SHARE * scene.area_mm2
+    problems = []
+    if still:
+        problems.append(
+            "the animal hardly leaves its place, so that it is a part of the background; it was "
+            "separated from the bare floor instead, so check its outline in the replay, or add "
+            "some seconds of the empty arena"
+        )
+    if share < 0.8:
+        problems.append(
+            f"the animal was found in only {share:.0%} of the inspected frames; cut off the time "
+            "before it came and after it left, and check that the whole arena is in view"
+        )
+    facts = {
+        "animal_length_mm": length,
+        "animal_area_mm2": scene.area_mm2,
+        "animal_share": share,
+        "animal_sits_still": still,
+    }
+    return facts, problems
+
+
+def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | None:
+    """Standard deviation, mm, of pixels over the sample (n, H, W) mm; None if unknown.
+
+    Two thirds of the differences are below one standard deviation of theirs, whatever moves through
+    the remaining third.
+    """
+    changes = [
+        np.abs(after - before)[(before > 0) & (after > 0)]
+        for before, after in zip(sample[:-1:4, where], sample[1::4, where], strict=False)
+    ]
+    known = np.concatenate(changes) if changes else np.empty(0)
+    return float(np.percentile(known, 68.3)) / math.sqrt(2.0) if len(known) else None
 
 
 # Findings of `liex doctor` as lines of text.
@@ -455,8 +681,10 @@ def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
     for problem in (*findings["missing"], *findings["problems"]):
         console.print(Text(printable(f"- {problem}"), style="yellow"), soft_wrap=True)
     if findings["arenas"]:
-        told = "several arenas are seen; lines for a plan, with subject_id and group to be added:"
-        console.print(Text(told), soft_wrap=True)
+        several = (
+            "several arenas are found; lines for a plan, with subject_id and group to be added:"
+        )
+        console.print(Text(several), soft_wrap=True)
         for line in findings["arenas"]:
             console.print(Text(line), soft_wrap=True)
     if findings["next"]:
@@ -475,7 +703,9 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
         "shape": findings["arena"] and Arena.from_dict(findings["arena"]),
         "fixtures": fixtures,
         "passing": [one for one in fixtures if (one.since_s, one.until_s) != (None, None)],
-        "sensor": "" if scene.get("sensor") is None else SensorCard.from_dict(scene["sensor"]),
+        "sensor": ""
+        if scene.get("sensor") is None
+        else camera.SensorCard.from_dict(scene["sensor"]),
     }
     texts = {
         name: " ".join(environment.from_string(template).render(values).split())

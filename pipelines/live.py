@@ -11,33 +11,80 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import chain, islice, tee
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from liex_lab.dashboards.replay.layouts import live_blueprint
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
+from liex_lab.recordings import recording, streaming
 from liex_lab.recordings.frame import marked
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions.viewer import LiveView, need_screen
+from liex_lab.tracking import observations, track
+from liex_lab.tracking.curve import OnlineTracker
+from liex_lab.tracking.tracker import FrameTracker
 
 from .build import build_recording, build_tracker
-
-if TYPE_CHECKING:
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.recordings.streaming import Arrival, Arriving
-    from liex_lab.tracking.track import Track, Tracked
-    from liex_lab.tracking.tracker import FrameTracker
 
 # first frames, from which the background, the floor and the animal's size are learned
 LEARN_FRAMES = 90
 _AT_ONCE = 16
 _LONG_S = 0.2
-Viewer = Callable[["FrameTracker", "Arriving"], Any]
+Viewer = Callable[[FrameTracker, streaming.Arriving], Any]
+
+
+def follow_live(
+    source: str,
+    plan: Plan,
+    *,
+    replay: bool = False,
+    to: str = "viewer",
+    patience_s: float = 3.0,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Show the skeletons of an ongoing recording in a Rerun viewer; returns measured latencies.
+
+    Args:
+        source: a file or folder that is being written, HOST:PORT of a sender, or, with `replay`, a
+            recording.
+        plan: all settings of the run.
+        replay: play back a finished recording at its own pace, as if it were live.
+        to: 'viewer' starts a viewer on this machine; else a viewer's address, or an .rrd file.
+        patience_s: time without growth after which a file counts as finished, s.
+        progress: receives the number of processed frames.
+
+    Returns:
+        Numbers: name, n_frames, n_live (frames whose latency was measured), latency_median_ms and
+            latency_p95_ms (None if absent), n_measured, n_bridged.
+
+    Raises:
+        LiexError: the source ends before its first frame, cannot be read, or there is no screen for
+            a viewer.
+    """
+    if to == "viewer":  # fail early, before a wait of minutes
+        need_screen("write a file with --to NAME.rrd, which any viewer opens")
+    arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
+    numbers, _ = track_live(
+        arriving,
+        plan,
+        progress=progress,
+        viewer=lambda tracker, arriving: LiveView(
+            arriving.name,
+            arriving.camera,
+            tracker.subject.T_arena_camera,
+            tracker.subject.skeleton,
+            to,
+            live_blueprint(tracker.subject.length_mm / 1000.0),
+        ),
+    )
+    return numbers
 
 
 def open_live(
     source: str, plan: Plan, *, replay: bool = False, patience_s: float = 3.0
-) -> Arriving:
+) -> streaming.Arriving:
     """Open a live source: a growing file, a network address, or a replayed recording.
 
     Args:
@@ -46,25 +93,23 @@ def open_live(
         replay: send the recording at `source` at its own pace instead.
         patience_s: a growing file ends when nothing has arrived for so long, s.
     """
-    from liex_lab.recordings.streaming import growing, received, replayed
-
     partial = plan.with_settings(["recording.accept_truncated=true"])
     if replay:
-        return replayed(build_recording(source, plan))
+        return streaming.replayed(build_recording(source, plan))
     host, colon, port = source.rpartition(":")
     if colon and port.isdigit() and not Path(source).exists():
-        return received(host, int(port))
-    return growing(lambda: build_recording(source, partial), patience_s)
+        return streaming.received(host, int(port))
+    return streaming.growing(lambda: build_recording(source, partial), patience_s)
 
 
-def follow_live(
-    arriving: Arriving,
+def track_live(
+    arriving: streaming.Arriving,
     plan: Plan,
     *,
     learn_frames: int = LEARN_FRAMES,
     viewer: Viewer | None = None,
     progress: Progress = silent,
-) -> tuple[dict[str, Any], Tracked]:
+) -> tuple[dict[str, Any], track.Tracked]:
     """Track a recording as its frames arrive; returns latencies and the smoothed track.
 
     Latency is from the arrival of a frame to its skeleton, for all frames since the first one that
@@ -85,18 +130,22 @@ def follow_live(
         RecordingError: the recording ended before its first frame.
         EstimationError: no animal is found in the frames that are learned from.
     """
-    from liex_lab.tracking.curve import OnlineTracker
-    from liex_lab.tracking.observations import Observations
-
     frames = arriving.frames
     held = list(islice(frames, learn_frames))
     if not held:
         raise RecordingError("the recording was over before it had a frame")
     progress(0, None, "learning the background, the floor and the animal's size")
-    tracker = build_tracker(_as_recording(arriving, held), plan)
+    first = recording.Recording(
+        name=arriving.name,
+        format="live",
+        camera=arriving.camera,
+        times_ns=np.array([arrival.frame.time_ns for arrival in held], np.int64),
+        read=lambda index: held[index].frame.depth,
+    )
+    tracker = build_tracker(first, plan)
     online = OnlineTracker(tracker.subject)
     view = viewer(tracker, arriving) if viewer else None
-    seen = []
+    history = []
     latency = list[float]()
     worked_until = time.perf_counter()
     keeping_up = False
@@ -104,21 +153,21 @@ def follow_live(
         keeping_up = keeping_up or some[0].at_s >= worked_until
         estimates = tracker.observe([arrival.frame for arrival in some])
         for k, arrival in enumerate(some):
-            seen.append(estimates[k : k + 1])
-            row: Track | None = online.add(seen[-1])
+            history.append(estimates[k : k + 1])
+            row: track.Track | None = online.add(history[-1])
             if view is not None and row is not None:
                 view.show(arrival.frame, row)
             worked_until = time.perf_counter()
             if keeping_up:
                 latency.append(worked_until - arrival.at_s)
-            progress(len(seen), None, "following")
+            progress(len(history), None, "following")
     if view is not None:
         view.close()
-    tracked = tracker.track(Observations.join(seen))
+    tracked = tracker.track(observations.Observations.join(history))
     quantiles = (np.quantile(latency, [0.5, 0.95]) * 1e3).tolist() if latency else [None, None]
     numbers = {
         "name": arriving.name,
-        "n_frames": len(seen),
+        "n_frames": len(history),
         "n_live": len(latency),
         "latency_median_ms": quantiles[0],
         "latency_p95_ms": quantiles[1],
@@ -128,19 +177,21 @@ def follow_live(
     return numbers, tracked
 
 
-def _chained(held: list[Arrival], frames: Iterator[Arrival]) -> Iterator[Arrival]:
+def _chained(
+    held: list[streaming.Arrival], frames: Iterator[streaming.Arrival]
+) -> Iterator[streaming.Arrival]:
     """All arrivals, with frames marked that repeat their predecessor."""
     arrivals, again = tee(chain(held, frames))
     for frame, arrival in zip(marked(one.frame for one in again), arrivals, strict=True):
         yield arrival._replace(frame=frame)
 
 
-def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:
+def _together(arrivals: Iterator[streaming.Arrival]) -> Iterator[list[streaming.Arrival]]:
     """Batches of up to 16 frames that have waited; a fresh frame ends its batch.
 
     A frame costs half as much in a batch.
     """
-    some: list[Arrival] = []
+    some: list[streaming.Arrival] = []
     for arrival in arrivals:
         some.append(arrival)
         if len(some) == _AT_ONCE or time.perf_counter() - arrival.at_s < _LONG_S:
@@ -148,17 +199,3 @@ def _together(arrivals: Iterator[Arrival]) -> Iterator[list[Arrival]]:
             some = []
     if some:
         yield some
-
-
-def _as_recording(arriving: Arriving, held: list[Arrival]) -> Recording:
-    """The frames that have arrived, as a recording."""
-    from liex_lab.recordings.recording import Recording
-
-    times = np.array([arrival.frame.time_ns for arrival in held], np.int64)
-    return Recording(
-        name=arriving.name,
-        format="live",
-        camera=arriving.camera,
-        times_ns=times,
-        read=lambda index: held[index].frame.depth,
-    )

@@ -25,18 +25,14 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, PlanError, StudyError, one_line
 from liex_lab.optics.camera import Camera
-from liex_lab.plan import Plan, known_plans
-from liex_lab.plan.plan import toml_value
-from liex_lab.plan.sections import Region
+from liex_lab.plan import Plan, known_plans, plan, sections
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
 from liex_lab.recordings.frame import region_mask
-from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.text_files import decoded, parse_toml, read_toml
+from liex_lab.runtime import durable, text_files
 from liex_lab.scene.background import sample_frames, usual_depth
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.zones import region_corners_px
-from liex_lab.sessions import Session
-from liex_lab.sessions.evidence import linked_recording
+from liex_lab.sessions import Session, evidence
 
 from .build import build_recording
 
@@ -73,7 +69,7 @@ def with_value(text: str, path: Keys, value: Any, origin: str = "the file") -> s
             if found == wanted:
                 return made
     dotted = ".".join(str(part) for part in path if isinstance(part, str))
-    what = f"removing {dotted}" if value is None else f"{dotted} = {toml_value(value)}"
+    what = f"removing {dotted}" if value is None else f"{dotted} = {plan.toml_value(value)}"
     raise PlanError(
         f"{origin} is written in a way that cannot be changed without losing something of it; "
         f"change it by hand: {what}"
@@ -113,25 +109,25 @@ def _candidates(text: str, path: Keys, value: Any) -> Iterator[str]:
     import tomlkit
     from tomlkit.exceptions import TOMLKitError
 
-    told = None if value is None else toml_value(value)
-    if told is not None:  # `Plan.to_toml` writes `# key =` for an unset value
+    spelled = None if value is None else plan.toml_value(value)
+    if spelled is not None:  # `Plan.to_toml` writes `# key =` for an unset value
         header, key = (re.escape(name) for name in (".".join(map(str, path[:-1])), str(path[-1])))
         unset = rf"(^\[{header}\](?:(?!^\[).)*?^)# {key} =[ \t]*(?=\r?$)"
-        stated = f"{path[-1]} = {told}"
+        stated = f"{path[-1]} = {spelled}"
         yield re.sub(unset, lambda found: found[1] + stated, text, count=1, flags=re.M | re.S)
     for clear in (False, True):  # a table in several lines is removed first
         with suppress(TOMLKitError, LookupError, TypeError, ValueError, AttributeError):
             document = tomlkit.parse(text)
             if clear:
                 _set(document, path, None)
-            _set(document, path, told and tomlkit.value(told))
+            _set(document, path, spelled and tomlkit.value(spelled))
             made = tomlkit.dumps(document)
             yield re.sub(r"(?<!\r)\n", "\r\n", made) if "\r\n" in text else made
 
 
 _MOST_CORNERS = 200
 _REGION = ("arena", "region")
-_N_PICTURES = 9  # number of sampled frames for each pixel's usual depth
+_N_SAMPLED = 9  # number of sampled frames for each pixel's usual depth
 
 
 @dataclass(frozen=True)
@@ -242,10 +238,17 @@ class StatedRegions:
                 )
             value = None if corners is None else self._checked(key, session, corners)
             text = with_value(self._text(found, session), found.path, value, found.file.name)
-            self._check(found, text)
+            # valid for a run, for every recording that it applies to: all plans are resolved
+            if self._study is not None and found.path != _REGION:
+                _ = Study.from_table(text_files.parse_toml(text), found.file).sessions
+            else:
+                Plan.from_toml(text, found.file.name)
             _write(found.file, text)
         done = "states this region" if value is not None else "states no region any more"
-        return f"{found.file.name} {done}; measure again: {self._next(key, session, found)}"
+        command = f"liex run {self._recording(key, session)} --plan {shlex.quote(str(found.file))}"
+        if self._study is not None:
+            command = f"liex cohort {shlex.quote(str(self._study))}"
+        return f"{found.file.name} {done}; measure again: {command}"
 
     def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         """The usual depth of every pixel of a study's recording, in the whole image.
@@ -265,7 +268,8 @@ class StatedRegions:
         if key not in self._seen:
             whole = planned.plan.with_settings(["arena.region="])
             with build_recording(planned.recording, whole) as opened:
-                self._seen = {key: (_usual(opened), opened.camera)}
+                sample = np.clip(np.rint(sample_frames(opened, _N_SAMPLED)), 0, 65_535)
+                self._seen = {key: (usual_depth(sample.astype(np.uint16)), opened.camera)}
         return self._seen[key]
 
     def _planned(self, key: str) -> tuple[int, PlannedSession, Study]:
@@ -287,7 +291,9 @@ class StatedRegions:
         file = session.path.with_name(f"{session.path.stem}.plan.toml")
         stated = None
         with suppress(ValueError):
-            stated = _at(_table(file) if file.is_file() else parse_toml(session.plan), _REGION)
+            stated = _at(
+                _table(file) if file.is_file() else text_files.parse_toml(session.plan), _REGION
+            )
         return [Place("beside", "this recording, in a plan beside it", file, _REGION, stated)]
 
     def _shown(self, place: Place, session: Session | None) -> list[list[float]] | None:
@@ -321,7 +327,7 @@ class StatedRegions:
 
     def _text(self, place: Place, session: Session | None) -> str:
         try:
-            return decoded(place.file.read_bytes())
+            return text_files.decoded(place.file.read_bytes())
         except FileNotFoundError:
             if session is not None and place.name == "beside":
                 return session.plan
@@ -329,25 +335,12 @@ class StatedRegions:
         except (OSError, ValueError) as error:
             raise PlanError(f"{place.file} cannot be read ({one_line(error)})") from None
 
-    def _check(self, place: Place, text: str) -> None:
-        """Check that the file is valid for a run, for every recording it applies to."""
-        if self._study is not None and place.path != _REGION:
-            _ = Study.from_table(parse_toml(text), place.file).sessions  # every plan resolved
-        else:
-            Plan.from_toml(text, place.file.name)
-
     def _recording(self, key: str, session: Session | None) -> str:
         """The recording's name in a command."""
         if self._study is not None:
             return shlex.quote(self._planned(key)[1].recording)
-        linked = linked_recording(session) if session is not None else None
+        linked = evidence.linked_recording(session) if session is not None else None
         return shlex.quote(linked) if linked else "RECORDING"
-
-    def _next(self, key: str, session: Session | None, place: Place) -> str:
-        if self._study is not None:
-            return f"liex cohort {shlex.quote(str(self._study))}"
-        recording = self._recording(key, session)
-        return f"liex run {recording} --plan {shlex.quote(str(place.file))}"
 
 
 def _of_study(k: int, planned: PlannedSession, study: Study) -> list[Place]:
@@ -379,7 +372,7 @@ def _of_study(k: int, planned: PlannedSession, study: Study) -> list[Place]:
     return places
 
 
-def _region(stated: Any) -> Region:
+def _region(stated: Any) -> sections.Region:
     """A region as a plan parses it.
 
     Raises:
@@ -403,15 +396,9 @@ def _at(table: Any, path: Sequence[str]) -> Any:
 
 def _table(file: Path) -> dict[str, Any]:
     try:
-        return read_toml(file)
+        return text_files.read_toml(file)
     except (OSError, ValueError) as error:
         raise PlanError(f"{file.name} cannot be read as a plan ({one_line(error)})") from None
-
-
-def _usual(recording: Any) -> NDArray[np.uint16]:
-    """Each pixel's median depth over sampled frames that read it."""
-    sample = sample_frames(recording, _N_PICTURES)
-    return usual_depth(np.clip(np.rint(sample), 0, 65_535).astype(np.uint16))
 
 
 def _write(file: Path, text: str) -> None:
@@ -421,7 +408,7 @@ def _write(file: Path, text: str) -> None:
         PlanError: it cannot be written.
     """
     try:
-        with replacing(file) as part:
+        with durable.replacing(file) as part:
             part.write_bytes(text.encode("utf-8"))
             if file.is_file():
                 shutil.copymode(file, part)

@@ -10,14 +10,12 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from liex_lab.runtime.progress import Progress, silent
-
-if TYPE_CHECKING:
-    from liex_lab.simulation.recording import SyntheticSession
+from liex_lab.sessions import mcap, provenance
+from liex_lab.simulation import locomotion, recording, species
 
 SEED = 341  # a walk in which the animal turns, crosses its arena and rears once
 SPINE_MM = 65.0
@@ -40,13 +38,10 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
     Returns:
         The path of the recording.
     """
-    from liex_lab.sessions.mcap import McapWriter
-    from liex_lab.sessions.provenance import Provenance
-
     mouse = virtual_mouse()
     path = Path(path)
     path.unlink(missing_ok=True)
-    origin = Provenance(
+    origin = provenance.Provenance(
         name=path.stem,
         skeleton=mouse.skeleton,
         camera=mouse.camera,
@@ -54,7 +49,7 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
         floor_distance_mm=mouse.floor.distance_mm,
         input_sha256="",
     )
-    writer = McapWriter(path, origin, level=_LEVEL, chunk_size=_CHUNK_BYTES)
+    writer = mcap.McapWriter(path, origin, level=_LEVEL, chunk_size=_CHUNK_BYTES)
     try:
         for frames in mouse.chunks(16):
             kept = [frame for frame in frames if frame.index not in LEFT_OUT]
@@ -67,20 +62,15 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
     return path
 
 
-def virtual_mouse() -> SyntheticSession:
+def virtual_mouse() -> recording.SyntheticSession:
     """The animal of the sample, with arena, camera and the exact truth of every frame."""
-    from liex_lab.simulation.locomotion import walking_session
-    from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
-
-    return walking_session(
-        SEED, N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk"
+    return locomotion.walking_session(
+        SEED, N_FRAMES, sensor=species.PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk"
     )
 
 
-def _card(path: Path, mouse: SyntheticSession) -> str:
+def _card(path: Path, mouse: recording.SyntheticSession) -> str:
     """The sample's card, TOML."""
-    from liex_lab.sessions.provenance import package_version
-
     facts = {
         "what": (
             "a virtual mouse that walks, turns and rears in a round arena, seen from above by an "
@@ -93,7 +83,7 @@ def _card(path: Path, mouse: SyntheticSession) -> str:
         ),
         "licence": "BSD-3-Clause, as the rest of liex_lab",
         "made_by": "liex_lab.pipelines.sample.write_sample",
-        "made_with": f"zstandard {package_version('zstandard')}",
+        "made_with": f"zstandard {provenance.package_version('zstandard')}",
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "bytes": path.stat().st_size,
         "n_frames": N_FRAMES - len(LEFT_OUT),

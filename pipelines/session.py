@@ -4,64 +4,203 @@ The whole pipeline on one page: recording -> foreground -> candidate poses of si
 (association, smoothing) -> actions -> behaviour tables. Single frames are measured in chunks and
 written immediately, so an interrupted run resumes where it stopped; the track and all later stages
 use all frames at once.
+
+Observations do not depend on neighbouring frames, so workers can measure a long recording in
+shards, and the tables are those of one process. Shards begin at multiples of `LENGTH` frames and
+have folders of their own until they are appended in order: an interruption costs only the shards in
+progress.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from liex_lab.dashboards.replay.layouts import replay_blueprint
+from liex_lab.dashboards.report.views import write_views
 
+from liex_lab.actions import ethogram, timeline, vocabulary
+from liex_lab.behaviour import summary
+from liex_lab.behaviour.bouts import recognise
+from liex_lab.catalog import DEMO, find_sample
 from liex_lab.errors import PlanError, RecordingError
+from liex_lab.optics.camera import unusual_centre, unusual_lens
 from liex_lab.plan import Plan
-from liex_lab.recordings.frame import FrameRooms
-from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN
-from liex_lab.runtime.memory import Allocator, rest
-from liex_lab.runtime.places import inside
-from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.threads import in_background, prefetch, serial_products
+from liex_lab.plan.subject import animal_part, find_subject, letters, same
+from liex_lab.recordings.frame import DepthFrame, FrameRooms
+from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN, unwritable_times
+from liex_lab.runtime import memory, places, processes, threads
+from liex_lab.runtime.processes import WorkerPool
+from liex_lab.runtime.progress import Progress, silent, telling_of_compiling
+from liex_lab.sessions import (
+    Provenance,
+    Session,
+    SessionWriter,
+    checkpoint,
+    evidence,
+)
+from liex_lab.sessions.folder import (
+    check_room,
+    check_writable,
+    megabytes,
+    part_folder,
+    put_back_session,
+)
+from liex_lab.sessions.verdict import OTHER_ANIMAL, Verdict
+from liex_lab.sessions.writer import (
+    append_shard,
+    is_whole,
+    open_unfinished,
+    shard_folder,
+    shard_writer,
+)
+from liex_lab.tables.rows import Rows, bout_rows
+from liex_lab.tables.schema import BOUTS, empty_table
+from liex_lab.tracking import curve, observations, trust
+from liex_lab.tracking.tracker import FrameTracker
 
 from .build import (
     build_estimator,
+    build_provenance,
     build_recogniser,
     build_recording,
     build_rules,
+    build_surroundings,
     build_water,
+    pinned,
+    session_bytes,
     why_nameless,
 )
 from .choice import USUAL, Fitted, fit_plan
 from .compiling import compile_ahead
-from .origin import build_provenance, build_surroundings, session_bytes
-from .regions import pinned
-from .shards import CHUNK, LENGTH, MEASURING, Shard, measure_shards
-from .workers import WorkerPool
 
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from liex_lab.actions.timeline import Recognised, TimelineModel
-    from liex_lab.behaviour.summary import Behaviour
-    from liex_lab.recordings.frame import DepthFrame
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions import Provenance, Session, SessionWriter
-    from liex_lab.sessions.verdict import Verdict
-    from liex_lab.sessions.writer import BlueprintMaker, ReportMaker
-    from liex_lab.tables.rows import Rows
-    from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.tracker import FrameTracker
+
+LENGTH = 500  # frames per shard: some seconds of work, the cost of an interruption
+CHUNK = 32  # frames in memory at a time
+MEASURING = "measuring poses"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A span of frames of a recording, with all that a remote worker needs to measure it.
+
+    Attributes:
+        recording: path or address of the recording.
+        plan: how it is measured.
+        tracker: the prepared tracker; a pickle omits its estimator, which is large.
+        origin: provenance of the session.
+        folder: folder of the result.
+        start: first frame.
+        stop: frame after the last one.
+    """
+
+    recording: str
+    plan: Plan
+    tracker: FrameTracker
+    origin: Provenance
+    folder: Path
+    start: int
+    stop: int
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without the large model: a worker loads it from the file and caches it."""
+        return {**vars(self), "tracker": replace(self.tracker, estimator=None)}  # type: ignore[arg-type]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        tracker = replace(state["tracker"], estimator=build_estimator(state["plan"]))
+        vars(self).update({**state, "tracker": tracker})
+
+
+def measure_shard(shard: Shard) -> Shard:
+    """Measure a shard and write it: the task of a worker. It may safely run twice.
+
+    Returns:
+        The same shard, once its folder is complete.
+    """
+    opened = _opened(shard.recording, shard.plan.to_toml(), shard.origin.input_sha256)
+    first_ns = int(opened.times_ns[0]) if shard.start else None
+    rooms = FrameRooms()
+    coming = opened.frames(shard.start, shard.stop)
+    with shard_writer(shard.folder, shard.origin, first_ns) as add:
+        while frames := rooms.filled(coming, CHUNK):
+            add(frames, shard.tracker.observe(frames))
+    return shard
+
+
+@lru_cache(maxsize=1)
+def _opened(recording: str, plan_toml: str, input_sha256: str) -> Recording:
+    """The recording, kept open for this process's next shards; the hash distinguishes versions."""
+    return build_recording(recording, Plan.from_toml(plan_toml))
+
+
+def measure_shards(pool: WorkerPool, whole: Shard, path: Path, progress: Progress) -> None:
+    """Measure all frames of a recording that its unfinished session lacks.
+
+    Afterwards the session resumes as if interrupted after its last frame. Completed shards are
+    kept, even after an error.
+
+    Args:
+        pool: the worker pool.
+        whole: the recording as one shard; its folder is not used.
+        path: the planned session folder; the unfinished session is next to it.
+        progress: called shard by shard.
+
+    Raises:
+        SessionError: a worker died, or another process writes the session.
+    """
+    held = open_unfinished(path, whole.origin)
+    try:
+        held.begin_shards()
+        began = time.monotonic()
+        done = held.state.n_frames
+        planned = [
+            replace(whole, start=start, stop=stop, folder=shard_folder(held.folder, start, stop))
+            for start, stop in _cuts(done, whole.stop)
+        ]
+        waiting = list(planned)
+        n_left = whole.stop - done
+        there = [shard for shard in planned if is_whole(shard.folder)]
+        others = [shard for shard in planned if shard not in there]
+        for shard in chain(there, pool.each(measure_shard, others)):
+            n_left -= shard.stop - shard.start
+            while waiting and is_whole(waiting[0].folder):
+                one = waiting.pop(0)
+                seconds = round(held.seconds_before + time.monotonic() - began, 3)
+                append_shard(held, one.folder, one.stop, seconds)
+            progress(whole.stop - n_left, whole.stop, MEASURING)
+    finally:
+        held.leave(keep=True)
+
+
+def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:
+    """Frames first to stop cut at multiples of `LENGTH`, the same shards in every run."""
+    while first < stop:
+        last = min(stop, (first // LENGTH + 1) * LENGTH)
+        yield first, last
+        first = last
+
+
+# Measurement of frames, and of a whole recording.
 
 
 _AT_ONCE = 2
-Observed = tuple["list[DepthFrame]", "Observations"]
+# imported while the first frames are measured: for the replay, `transitions` and the figures
+HEAVY = ("rerun", "scipy.special", "matplotlib.figure", "matplotlib.backends.backend_pdf")
+Observed = tuple[list[DepthFrame], observations.Observations]
 
 
 def observed(
@@ -83,10 +222,10 @@ def observed(
         for frames in stretches:
             yield frames, tracker.observe(frames)
         return
-    waiting: deque[tuple[list[DepthFrame], Future[Observations]]] = deque()
+    waiting: deque[tuple[list[DepthFrame], Future[observations.Observations]]] = deque()
     # matrix products are serial meanwhile: the limit is per process, not per thread
     with (
-        serial_products(),
+        threads.serial_products(),
         ThreadPoolExecutor(
             _AT_ONCE, initializer=numba.set_num_threads, initargs=(n_threads // _AT_ONCE,)
         ) as pool,
@@ -103,7 +242,7 @@ def observed(
                 coming.cancel()
 
 
-def _first(waiting: deque[tuple[list[DepthFrame], Future[Observations]]]) -> Observed:
+def _first(waiting: deque[tuple[list[DepthFrame], Future[observations.Observations]]]) -> Observed:
     """The oldest stretch, once it is measured."""
     frames, coming = waiting.popleft()
     return frames, coming.result()
@@ -123,52 +262,53 @@ def _may_share() -> bool:
         return False
 
 
-def measure_session(
+def run_session(
     recording: str | Path | Recording,
-    plan: Plan | None,
-    out: str | Path,
+    plan: Plan | None = None,
+    out: str | Path = ".",
     *,
     settings: Sequence[str] = (),
     folder: Path | None = None,
     overwrite: bool = False,
     notes: Mapping[str, Any] | None = None,
-    blueprint: BlueprintMaker | None = None,
-    report: ReportMaker | None = None,
-    pool: WorkerPool | None = None,
+    workers: int = 1,
+    pool: processes.WorkerPool | None = None,
+    report: bool = True,
     progress: Progress = silent,
 ) -> Path:
-    """Measure every frame of a recording and write the session folder.
+    """Measure every frame of a depth recording and write a session folder; returns its path.
 
-    An unfinished session of the same recording and plan is continued. A plan that the recording
-    does not fit is refused before anything is measured; if none is named, the bundled one that fits
-    is used. With a worker pool, shards of a long recording (more than two shards, and more frames
-    than the pool's minimum) that is given by its path are measured in parallel; the tables are the
-    same.
+    The steps are background subtraction, single-frame pose estimation by the Lie-X method,
+    association and smoothing over the whole recording, kinematics and ethogram. If the recording,
+    the plan or the animal cannot be used, no partial output remains. An unfinished session of the
+    same recording and plan is continued.
 
     Args:
-        recording: a path or address, or an open recording.
-        plan: everything that the run depends on; None uses the bundled plan that fits.
-        out: folder of the session, which is named after the plan's session or the recording.
-        settings: changes to the plan if none was named, as for `Plan.with_settings`.
-        folder: the session folder itself, instead of `out/NAME.liex`.
-        overwrite: replace an existing session, once the new one is complete.
-        notes: additional contents of session.json, see `SessionWriter.note`.
-        blueprint: makes the layout of the replay, see `SessionWriter`.
-        report: makes the report in the folder, see `SessionWriter`.
-        pool: workers for the shards of a long recording.
-        progress: called frame by frame.
+        recording: path of a recording, address of a virtual one, or an open recording.
+        plan: all settings of the run; None selects the bundled plan that fits, the mouse's if it
+            does.
+        out: parent of the session folder `<recording's name>.liex`.
+        settings: overrides when no plan is given, texts like 'animal.spine_mm=65'.
+        folder: the session folder, to use another name.
+        overwrite: replace an existing session.
+        notes: additional facts for session.json, see `SessionWriter.note`.
+        workers: processes for parallel shards of a long recording; 0 uses one for every two cores,
+            four at most, for more than 6,000 frames. The tables are the same for any number.
+            Scripts that use more than one must guard their entry point with `if __name__ ==
+            "__main__":`, as processes are spawned.
+        pool: a worker pool to use instead of `workers` local processes.
+        report: whether to write the report with its figures.
+        progress: receives progress reports.
 
     Returns:
         The session folder.
 
     Raises:
-        SessionError: a session exists already, or another process writes it.
-        RecordingError: the recording cannot be opened or read.
-        PlanError: the plan, or a file that it names, cannot be used.
-        MisfitError: the recording does not show the plan's animal.
-        EstimationError: no animal is found.
+        LiexError: the recording, the plan or the animal in it cannot be used; the message gives
+            advice.
     """
     started = time.perf_counter()
+    memory.check_limits()
     first = plan or Plan.load(USUAL).with_settings(settings)
     if first.arenas is not None:
         raise PlanError(
@@ -176,35 +316,44 @@ def measure_session(
             "them with `liex run`, or in Python with run_arenas"
         )
     with (
-        in_background(partial(build_estimator, first)) as estimator,
+        threads.imported_ahead(*HEAVY),
+        telling_of_compiling(progress) as progress,
+        threads.in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):
-        from liex_lab.recordings.timestamps import unwritable_times
-        from liex_lab.sessions import SessionWriter
-
-        folder = folder or inside(Path(out), first.session.name or opened.name, ".liex")
-        if told := unwritable_times(opened.times_ns):
-            raise RecordingError(f"of {opened.name} {told}")
-        whose: list[str] = []
+        folder = folder or places.inside(Path(out), first.session.name or opened.name, ".liex")
+        if problem := unwritable_times(opened.times_ns):
+            raise RecordingError(f"of {opened.name} {problem}")
+        cautions: list[str] = []
         if isinstance(recording, str | Path) and opened.sources:
-            whose = _check_subject(opened, Path(recording), first)
+            cautions = _check_subject(opened, Path(recording), first)
         check_unused(folder, overwrite)
         unnamed = None if plan else settings
         compile_ahead(first.animal.skeleton, progress)
         progress(0, None, "learning the background, the floor and the animal's size")
         fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
-        fitted = replace(fitted, notes=(*fitted.notes, *whose))
+        fitted = replace(fitted, notes=(*fitted.notes, *cautions))
         prepared = prepare(fitted, folder, started, progress)
-        if pool is not None and isinstance(recording, str | Path):
+        if (pool := pool or processes.processes_for(workers)) and isinstance(recording, str | Path):
             prepared.measure_by(pool, recording, progress)
-        with SessionWriter(
-            folder, prepared.origin, overwrite=overwrite, blueprint=blueprint, report=report
-        ) as writer:
-            writer.resume(lambda row: prepared.recording.frame(row).depth)
+        with prepared.writing(overwrite, report) as writer:
             with closing(read_ahead(prepared.recording, writer.n_frames)) as chunks:
                 prepared.measure_all(chunks, writer, progress)
-            session = prepared.finish(writer, recording, notes)
-    return session.path
+            return prepared.finish(writer, recording, notes).path
+
+
+def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
+    """Measure the bundled sample recording; returns its session folder.
+
+    An earlier demo session in the same folder is replaced.
+
+    Args:
+        out: parent of the session folder.
+        progress: receives progress reports.
+    """
+    return run_session(
+        find_sample(DEMO), Plan.load("mouse"), out, overwrite=True, progress=progress
+    )
 
 
 def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
@@ -213,21 +362,18 @@ def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
     Without a name in the plan, the other one is noted in the metadata; a caution is returned if the
     plan's differs from the metadata's.
     """
-    from liex_lab.plan.subject import animal_part, find_subject, letters, same
-    from liex_lab.sessions.verdict import OTHER_ANIMAL
-
-    told = str(opened.metadata.get("subject_id", ""))
-    found = find_subject(path, told)
+    recorded = str(opened.metadata.get("subject_id", ""))
+    found = find_subject(path, recorded)
     in_metadata = found.origin == "metadata"
     stated = plan.session.subject_id
     if stated is None:
-        named = animal_part(told) if in_metadata else found.id if found.origin else ""
+        named = animal_part(recorded) if in_metadata else found.id if found.origin else ""
         opened.metadata["subject_id"] = named
         return []
     differ = in_metadata and same(found.id) != same(letters(animal_part(stated)))
     # for several arenas the metadata name one animal at most
     alone = plan.arena.region is None
-    return [f"{OTHER_ANIMAL}, {told} instead of {stated}"] if differ and alone else []
+    return [f"{OTHER_ANIMAL}, {recorded} instead of {stated}"] if differ and alone else []
 
 
 def check_unused(folder: Path, overwrite: bool) -> None:
@@ -236,12 +382,9 @@ def check_unused(folder: Path, overwrite: bool) -> None:
     Raises:
         SessionError: the session cannot be written there.
     """
-    from liex_lab.sessions.checkpoint import check_free
-    from liex_lab.sessions.folder import check_writable, part_folder, put_back_session
-
     put_back_session(folder)
     check_writable(folder, overwrite)
-    check_free(part_folder(folder))
+    checkpoint.check_free(part_folder(folder))
 
 
 @dataclass
@@ -265,12 +408,25 @@ class Prepared:
         """The recording as it is measured."""
         return self.fitted.recording
 
+    @contextmanager
+    def writing(self, overwrite: bool, report: bool) -> Iterator[SessionWriter]:
+        """The writer of the session's folder, which continues an unfinished one."""
+        with SessionWriter(
+            self.folder,
+            self.origin,
+            overwrite=overwrite,
+            blueprint=replay_blueprint,
+            report=write_views if report else None,
+        ) as writer:
+            writer.resume(lambda row: self.recording.frame(row).depth)
+            yield writer
+
     def measure(self, frames: list[DepthFrame], writer: SessionWriter) -> None:
         """Measure consecutive frames of this recording and pass them to the session's writer."""
         began = time.perf_counter()
-        seen = self.fitted.tracker.observe(frames)
+        estimates = self.fitted.tracker.observe(frames)
         self.timings["track"] += time.perf_counter() - began
-        writer.add(frames, observations=seen)
+        writer.add(frames, observations=estimates)
 
     def measure_all(
         self, stretches: Iterable[list[DepthFrame]], writer: SessionWriter, progress: Progress
@@ -278,13 +434,15 @@ class Prepared:
         """Measure consecutive stretches of frames, some concurrently, and write them."""
         with closing(observed(self.fitted.tracker, stretches)) as coming:
             began = time.perf_counter()
-            for frames, seen in coming:
+            for frames, estimates in coming:
                 self.timings["track"] += time.perf_counter() - began
-                writer.add(frames, observations=seen)
+                writer.add(frames, observations=estimates)
                 progress(frames[-1].index + 1, len(self.recording), MEASURING)
                 began = time.perf_counter()
 
-    def measure_by(self, pool: WorkerPool, recording: str | Path, progress: Progress) -> None:
+    def measure_by(
+        self, pool: processes.WorkerPool, recording: str | Path, progress: Progress
+    ) -> None:
         """Let workers measure the shards of a long recording (more than two shards).
 
         Args:
@@ -315,13 +473,11 @@ class Prepared:
                 to an open recording.
             notes: additional contents of session.json.
         """
-        from liex_lab.sessions.evidence import link_to
-
         began = time.perf_counter()
         verdict = make_track(writer, self.fitted)
         self.timings["track"] += time.perf_counter() - began
         if isinstance(source, str | Path):
-            writer.note(input=link_to(source, self.folder))
+            writer.note(input=evidence.link_to(source, self.folder))
         writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
         writer.note(**dict(notes or {}))
         return conclude(writer, self.fitted.plan, self.timings)
@@ -341,11 +497,8 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
         PlanError: the recogniser was made for another skeleton.
         SessionError: there is not enough disk space.
     """
-    from liex_lab.sessions.checkpoint import hash_once
-    from liex_lab.sessions.folder import check_room, megabytes, part_folder
-
     build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
-    hash_once(fitted.recording, part_folder(folder), progress)
+    checkpoint.hash_once(fitted.recording, part_folder(folder), progress)
     origin = build_provenance(fitted.recording, fitted.plan, fitted.tracker, progress)
     needed = session_bytes(
         fitted.recording, fitted.plan, fitted.tracker.spine_mm, origin.floor_distance_mm
@@ -367,7 +520,7 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
         return
     rooms = FrameRooms()
     frames = opened.frames(first)
-    yield from prefetch(iter(lambda: rooms.filled(frames, CHUNK), []))
+    yield from threads.prefetch(iter(lambda: rooms.filled(frames, CHUNK), []))
 
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
@@ -376,19 +529,13 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     Returns:
         The verdict on the session.
     """
-    from liex_lab.optics.camera import unusual_centre, unusual_lens
-    from liex_lab.sessions.verdict import Verdict
-    from liex_lab.tracking.curve import repeat_messages
-    from liex_lab.tracking.observations import Observations
-    from liex_lab.tracking.trust import why_too_fast
-
     tracker = fitted.tracker
-    whole = writer.observations(Observations)
+    whole = writer.observations(observations.Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
     subject = tracker.subject
     recording = fitted.recording
-    fast = why_too_fast(tracked.track, subject.length_mm)
-    frozen, copied = repeat_messages(whole.times_ns, whole.repeats, tracker.noisy)
+    fast = trust.why_too_fast(tracked.track, subject.length_mm)
+    frozen, copied = curve.repeat_messages(whole.times_ns, whole.repeats, tracker.noisy)
     water = build_water(fitted.plan)
     # with water the ideal camera has another focal length
     lens = unusual_lens(recording.camera) if water is None else ""
@@ -426,8 +573,8 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
 def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
     """Measure the behaviour and move the session to its folder; returns the finished session."""
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
-    writer.note(**notes, problems=_told_refused(notes))
-    rest()
+    writer.note(**notes, problems=_refused_sentence(notes))
+    memory.rest()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
@@ -435,9 +582,9 @@ def measure_behaviour(
     rows: Rows,
     plan: Plan,
     origin: Provenance,
-    allocate: Allocator = np.empty,
+    allocate: memory.Allocator = np.empty,
     seams: Sequence[int] = (),
-) -> tuple[Behaviour, dict[str, Any]]:
+) -> tuple[summary.Behaviour, dict[str, Any]]:
     """The behaviour of a track by the plan's recogniser or rules, and notes for session.json.
 
     Args:
@@ -447,13 +594,10 @@ def measure_behaviour(
         allocate: allocator of large arrays, such as one of files on disk.
         seams: rows across which nothing is measured, see `Surroundings`.
     """
-    from liex_lab.behaviour.summary import measure_rows, moving_rows
-    from liex_lab.tables.schema import BOUTS, empty_table
-
     recogniser = build_recogniser(plan, origin.skeleton)
     rules = build_rules(plan)
     around = replace(build_surroundings(origin), seams=seams)
-    moved = moving_rows(rows, rules, around, allocate)
+    moved = summary.moving_rows(rows, rules, around, allocate)
     named: dict[str, Any] = {}
     notes: dict[str, Any] = {}
     if recogniser is not None:
@@ -461,12 +605,15 @@ def measure_behaviour(
     elif nameless := why_nameless(plan, origin.skeleton):
         named = {"bouts": empty_table(BOUTS), "actions": {}}
         notes = {"no_actions": nameless}
-    rest()
-    return measure_rows(rows, rules, around, moved=moved, allocate=allocate, **named), notes
+    memory.rest()
+    return summary.measure_rows(rows, rules, around, moved=moved, allocate=allocate, **named), notes
 
 
 def name_actions(
-    recogniser: TimelineModel, rows: Rows, moved: pd.DataFrame, allocate: Allocator = np.empty
+    recogniser: timeline.TimelineModel,
+    rows: Rows,
+    moved: pd.DataFrame,
+    allocate: memory.Allocator = np.empty,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """The ethogram of a track by a recogniser, and notes for session.json.
 
@@ -481,10 +628,6 @@ def name_actions(
         the actions that cannot be resolved at the frame rate, and the bouts that were refused since
         they contradict their definition.
     """
-    from liex_lab.actions.vocabulary import printed_meanings
-    from liex_lab.behaviour.bouts import recognise
-    from liex_lab.tables.rows import bout_rows
-
     found = recognise(recogniser, rows.track, rows.wall_distance_mm, moved, allocate)
     notes = {
         "action_model": {
@@ -495,31 +638,29 @@ def name_actions(
         "unresolved_actions": found.unresolved,
         "refused_bouts": {"bouts": _refusals(found, rows.track.times_ns)},
     }
-    meanings = printed_meanings(recogniser.skeleton, recogniser.definitions)
+    meanings = vocabulary.printed_meanings(recogniser.skeleton, recogniser.definitions)
     actions = {word: meanings.get(word, "") for word in recogniser.words if word}
     bouts = bout_rows(found.ethogram, rows.frames_table, str(recogniser.card.get("sha256", "")))
     return {"bouts": bouts, "actions": actions}, notes
 
 
-def _told_refused(notes: dict[str, Any]) -> list[str]:
+def _refused_sentence(notes: dict[str, Any]) -> list[str]:
     """A sentence on refused bouts for the session's problems; [] if there are none."""
     n = len(notes.get("refused_bouts", {}).get("bouts", []))
     if not n:
         return []
-    told = (
+    refused = (
         "1 bout did not meet the definition of its label and was"
         if n == 1
         else f"{n} bouts did not meet the definitions of their labels and were"
     )
-    return [f"{told} relabelled or left unlabelled (refused_bouts in session.json)."]
+    return [f"{refused} relabelled or left unlabelled (refused_bouts in session.json)."]
 
 
-def _refusals(found: Recognised, times_ns: NDArray[np.int64]) -> list[dict[str, Any]]:
+def _refusals(found: timeline.Recognised, times_ns: NDArray[np.int64]) -> list[dict[str, Any]]:
     """The refused bouts for session.json, in order of time; times are s since the first frame."""
-    from liex_lab.actions.ethogram import frame_stops
-
     start_s = (times_ns - times_ns[:1]) * 1e-9
-    stop_s = (frame_stops(times_ns) - times_ns[:1]) * 1e-9
+    stop_s = (ethogram.frame_stops(times_ns) - times_ns[:1]) * 1e-9
     return [
         {
             "action": one.action,

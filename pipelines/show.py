@@ -8,22 +8,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan import Plan
+from liex_lab.recordings.depth_kernels import to_millimetres
+from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Session, cutouts, evidence, rrd
 
 from .build import build_recording
-
-if TYPE_CHECKING:
-    from liex_lab.recordings.recording import Recording
-    from liex_lab.sessions import Session
 
 _CHUNK = 32  # frames in memory at a time
 
 
-def whole_pictures(
+def whole_images(
     session: str | Path, out: Path, recording: str | None = None, progress: Progress = silent
 ) -> Path:
     """Write the whole depth images of a session's recording into a replay.
@@ -42,24 +40,20 @@ def whole_pictures(
             has another hash.
         RecordingError: the recording cannot be read.
     """
-    from liex_lab.recordings.depth_kernels import to_millimetres
-    from liex_lab.sessions import Session
-    from liex_lab.sessions.cutouts import ALL
-    from liex_lab.sessions.evidence import provenance_of, skeleton_of
-    from liex_lab.sessions.rrd import ReplayWriter
-
     opened = Session.open(session, raw=True)
-    origin = replace(provenance_of(opened, skeleton_of(opened)), replay_depth=ALL)
-    with _recording_of(opened, recording, progress) as pictures:
-        replay = ReplayWriter(out, origin)
+    origin = replace(
+        evidence.provenance_of(opened, evidence.skeleton_of(opened)), replay_depth=cutouts.ALL
+    )
+    with _recording_of(opened, recording, progress) as images:
+        replay = rrd.ReplayWriter(out, origin)
         try:
-            for frames in pictures.chunks(_CHUNK):
+            for frames in images.chunks(_CHUNK):
                 replay.add(
                     [frame.index for frame in frames],
                     [frame.time_ns for frame in frames],
                     [to_millimetres(frame.depth) for frame in frames],
                 )
-                progress(frames[-1].index + 1, len(pictures), "reading whole pictures")
+                progress(frames[-1].index + 1, len(images), "reading whole images")
             replay.flushed()
         finally:
             replay.abandon()
@@ -68,24 +62,22 @@ def whole_pictures(
 
 def _recording_of(session: Session, stated: str | None, progress: Progress) -> Recording:
     """The recording of a session, opened with the session's plan after its hash is checked."""
-    from liex_lab.sessions.evidence import linked_recording
-
-    where = stated or linked_recording(session)
+    where = stated or evidence.linked_recording(session)
     if where is None:
         raise SessionError(
-            f"{session.path} does not say where its recording is, as sessions of earlier versions; "
+            f"{session.path} does not link to its recording, like sessions of earlier versions; "
             "name it with --recording"
         )
     if not where.startswith("synthetic:") and not Path(where).exists():
         raise SessionError(
-            f"whole depth pictures are missing: the recording of {session.path.name} is not at "
-            f"{where} any more; say where it is with --recording"
+            f"full depth images are missing: the recording of {session.path.name} is not at "
+            f"{where} any more; name it with --recording"
         )
     recording = build_recording(where, Plan.from_toml(session.plan, "plan.toml"), progress)
     try:
         if recording.digest(progress) != session.metadata["input"]["sha256"]:
             raise SessionError(
-                f"whole depth pictures are missing: {where} is not the recording that "
+                f"full depth images are missing: {where} is not the recording that "
                 f"{session.path.name} was made of, its hash is another one; name the right one "
                 "with --recording"
             )

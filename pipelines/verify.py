@@ -8,19 +8,20 @@ compared byte by byte, or else row by row.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from liex_lab.catalog import find_model, sha256
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan import Plan
+from liex_lab.recordings import open_recording
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Session, checkpoint, corrections
 
-if TYPE_CHECKING:
-    from liex_lab.sessions import Session
+from .session import run_session
 
-RunAgain = Callable[..., Path]  # liex_lab.api.run_session
 _NEEDED = (
     "schema_version",
     "session_id",
@@ -53,30 +54,34 @@ class Finding:
 
 
 def verify_session(
-    path: str | Path, run: RunAgain, recording: str | None = None, progress: Progress = silent
+    session: str | Path, recording: str | Path | None = None, *, progress: Progress = silent
 ) -> list[Finding]:
-    """Check all statements of a session about itself.
+    """Check whether a session is unchanged since it was written; returns the findings.
+
+    Compares the facts in session.json, the files with their SHA-256, the logs, the model and the
+    corrections.
 
     Args:
-        path: the session folder; the original measurements and the log of corrections are checked.
-        run: measures a recording, `liex_lab.api.run_session`.
-        recording: is measured again, which takes as long as the first time; None leaves it out.
-        progress: called while the recording is measured.
+        session: the session folder.
+        recording: its recording, to check whether re-running reproduces the session, which takes as
+            long as the first run. None skips this.
+        progress: receives progress of the second run.
+
+    Returns:
+        One `Finding` per check; its state is ok, wrong or note.
 
     Raises:
-        SessionError: there is no session at all.
+        SessionError: there is no session.
     """
-    from liex_lab.sessions import Session
-
-    session = Session.open(path, raw=True)
+    opened = Session.open(session, raw=True)
     found = [
-        *_provenance(session),
-        *_files(session),
-        *_logs(session),
-        *_model(session),
-        *_corrections(session),
+        *_provenance(opened),
+        *_files(opened),
+        *_logs(opened),
+        *_model(opened),
+        *_corrections(opened),
     ]
-    return [*found, *_again(session, run, recording, progress)] if recording else found
+    return [*found, *_again(opened, str(recording), progress)] if recording else found
 
 
 def _provenance(session: Session) -> Iterator[Finding]:
@@ -85,10 +90,10 @@ def _provenance(session: Session) -> Iterator[Finding]:
     if missing:
         yield Finding(
             "note",
-            f"session.json does not say {', '.join(missing)}; it was written by an older liex_lab",
+            f"session.json lacks {', '.join(missing)}; it was written by an older liex_lab",
         )
     else:
-        yield Finding("ok", "session.json says how the session was made")
+        yield Finding("ok", "session.json describes how the session was made")
     if Plan.from_toml(session.plan, "plan.toml") != Plan.from_table(
         session.metadata.get("plan", {}), "session.json"
     ):
@@ -108,8 +113,6 @@ def _files(session: Session) -> Iterator[Finding]:
 
 def _changed(folder: Path, stated: Mapping[str, Any]) -> list[str]:
     """Errors in files of a folder with stated sizes and hashes."""
-    from liex_lab.catalog import sha256
-
     wrong = []
     for name, facts in stated.items():
         file = folder / Path(name).name
@@ -124,38 +127,34 @@ def _changed(folder: Path, stated: Mapping[str, Any]) -> list[str]:
 
 def _corrections(session: Session) -> Iterator[Finding]:
     """Whether the log of corrections can be read and its tables are unchanged."""
-    from liex_lab.sessions.corrections import applies, corrected_folder, read_log
-
     try:
-        log = read_log(session.path)
+        log = corrections.read_log(session.path)
     except SessionError as error:
         yield Finding("wrong", str(error))
         return
     if not log.standing:
         return
-    if not applies(log, session.path, session.metadata):
+    if not corrections.applies(log, session.path, session.metadata):
         yield Finding(
             "note",
             "its corrections were made on another measurement; `liex correct apply` applies them",
         )
         return
-    wrong = _changed(corrected_folder(session.path), log.files)
+    wrong = _changed(corrections.corrected_folder(session.path), log.files)
     yield from (
         Finding("wrong", f"of the corrected tables, {sentence}; see `liex correct apply`")
         for sentence in wrong
     )
     if not wrong:
         authors = ", ".join(sorted({entry.author for entry in log.standing}))
-        told = f"{len(log.standing)} corrections ({authors}) stand beside it"
-        yield Finding("ok", f"{told}, and their {len(log.files)} files are as they were written")
+        counted = f"{len(log.standing)} corrections ({authors}) stand beside it"
+        yield Finding("ok", f"{counted}, and their {len(log.files)} files are as they were written")
 
 
 def _logs(session: Session) -> Iterator[Finding]:
     """Whether replay and messages are complete, by their own checksums and lengths."""
-    from liex_lab.sessions.checkpoint import rrd_messages
-
     try:
-        n = sum(1 for _ in rrd_messages(session.path / "session.rrd"))
+        n = sum(1 for _ in checkpoint.rrd_messages(session.path / "session.rrd"))
         n_depth = _depth_messages(session)
     except SessionError as error:
         yield Finding("wrong", str(error))
@@ -165,11 +164,11 @@ def _logs(session: Session) -> Iterator[Finding]:
         yield Finding("ok", f"session.rrd ({n} messages) is whole; no depth was to be kept")
     elif n_depth != wanted:
         yield Finding(
-            "wrong", f"session.mcap holds {n_depth} depth pictures and the session {wanted} frames"
+            "wrong", f"session.mcap holds {n_depth} depth images and the session {wanted} frames"
         )
     else:
         yield Finding(
-            "ok", f"session.rrd ({n} messages) and session.mcap ({n_depth} pictures) are whole"
+            "ok", f"session.rrd ({n} messages) and session.mcap ({n_depth} images) are whole"
         )
 
 
@@ -192,7 +191,6 @@ def _depth_messages(session: Session) -> int:
 
 
 def _model(session: Session) -> Iterator[Finding]:
-    from liex_lab.catalog import find_model, sha256
 
     stated = session.metadata.get("model", {})
     try:
@@ -209,13 +207,8 @@ def _model(session: Session) -> Iterator[Finding]:
     )
 
 
-def _again(
-    session: Session, run: RunAgain, recording: str, progress: Progress
-) -> Iterator[Finding]:
+def _again(session: Session, recording: str, progress: Progress) -> Iterator[Finding]:
     """Measure the recording again and compare the tables."""
-    from liex_lab.recordings import open_recording
-    from liex_lab.sessions import Session
-
     plan = Plan.from_toml(session.plan, "plan.toml")
     with open_recording(recording, fps=plan.recording.fps, topic=plan.recording.topic) as opened:
         if opened.digest(progress) != _at(session.metadata, "input.sha256"):
@@ -228,22 +221,18 @@ def _again(
                 "session": {**plan.session.model_dump(exclude_none=True), "name": session.name},
             }
         )
-        other = Session.open(run(recording, plan, scratch, progress=progress))
-        differing = [
-            path.name for path in _tables(session) if not _same_rows(path, other.path / path.name)
-        ]
-    if differing:
-        yield Finding(
-            "wrong",
-            "measured again, it has other rows in "
-            f"{', '.join(differing)}{_versions(session, other)}",
-        )
-    else:
-        yield Finding("ok", f"measured again, all {len(_tables(session))} tables are the same")
-
-
-def _tables(session: Session) -> list[Path]:
-    return [path for path in sorted(session.path.iterdir()) if path.suffix in _TABLES]
+        other = Session.open(run_session(recording, plan, scratch, report=False, progress=progress))
+        tables = [path for path in sorted(session.path.iterdir()) if path.suffix in _TABLES]
+        differing = [path.name for path in tables if not _same_rows(path, other.path / path.name)]
+        then, now = session.metadata.get("versions", {}), other.metadata["versions"]
+    if not differing:
+        yield Finding("ok", f"measured again, all {len(tables)} tables are the same")
+        return
+    changed = [
+        f"{name} {then.get(name)}, now {v}" for name, v in now.items() if then.get(name) != v
+    ]
+    because = f"; versions changed: {', '.join(changed)}" if changed else ""
+    yield Finding("wrong", f"measured again, it has other rows in {', '.join(differing)}{because}")
 
 
 def _same_rows(path: Path, other: Path) -> bool:
@@ -256,15 +245,6 @@ def _same_rows(path: Path, other: Path) -> bool:
         return True
     # `equals` treats empty cells as equal
     return path.suffix == ".parquet" and pd.read_parquet(path).equals(pd.read_parquet(other))
-
-
-def _versions(session: Session, other: Session) -> str:
-    then = session.metadata.get("versions", {})
-    now = other.metadata["versions"]
-    changed = [
-        f"{name} {then.get(name)}, now {now[name]}" for name in now if then.get(name) != now[name]
-    ]
-    return f"; versions changed: {', '.join(changed)}" if changed else ""
 
 
 def _at(document: dict[str, Any], dotted: str) -> Any:

@@ -15,10 +15,11 @@ import sys
 import tempfile
 import threading
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from liex_lab.pipelines.compiling import KERNELS, spelling
+from liex_lab.pipelines.compiling import KERNELS
 
 from liex_lab.catalog import find_sample
 
@@ -28,6 +29,30 @@ SOURCES = {
     "hand": "synthetic:gesture?seed=5&frames=60",
 }
 LEFT_OUT = ("liex_lab.recordings.", "liex_lab.simulation.")
+
+
+def spelling(kind: Any) -> Any:
+    """How `kernels.json` spells the numba type of an argument.
+
+    Raises:
+        TypeError: it is another kind, such as a function.
+    """
+    types: Any = import_module("numba.core.types")  # its stubs are incomplete
+    if isinstance(kind, types.Array):
+        return {"array": [spelling(kind.dtype), kind.ndim, kind.layout, kind.mutable]}
+    if isinstance(kind, types.Omitted):
+        return {"omitted": kind.value}
+    if isinstance(kind, types.NamedTuple | types.NamedUniTuple):
+        owner = kind.instance_class
+        fields = [spelling(field) for field in kind.types]
+        return {"record": f"{owner.__module__}:{owner.__qualname__}", "fields": fields}
+    if isinstance(kind, types.BaseTuple):
+        return {"tuple": [spelling(field) for field in kind.types]}
+    if isinstance(kind, types.Number | types.Boolean | types.NoneType) and not isinstance(
+        kind, types.Literal
+    ):
+        return str(kind)
+    raise TypeError(f"an argument of a kernel should be numbers, arrays or records, not {kind}")
 
 
 def called_kernels(arguments: list[str]) -> list[dict[str, Any]]:

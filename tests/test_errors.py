@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from liex_lab.pipelines.correct import correct_session
 from liex_lab.pipelines.doctor import examine
-from liex_lab.pipelines.session import measure_session
+from liex_lab.pipelines.session import run_session
 from typer.testing import CliRunner
 
 from liex_lab import cli
@@ -42,7 +42,7 @@ def test_a_correction_s_words_are_shown_whatever_they_are(tmp_path: Path) -> Non
     mouse = WalkingMouse(steady(1.0))
     session = write(tmp_path / "a.liex", mouse, plan_toml=Plan.load("mouse").to_toml())
     word = BoutEdit("add", "[/b]x", int(mouse.times_ns[2]), int(mouse.times_ns[20]))
-    correct_session(session.path, [word], author="[/red]\x1b[2J")
+    correct_session(session.path, [word], author="[/red]\x1b[2J", report=False)
     ran = CliRunner().invoke(
         cli.app, ["correct", "list", str(session.path)], env={"COLUMNS": "200"}
     )
@@ -71,7 +71,7 @@ def test_times_that_no_session_can_hold_are_told_by_doctor_and_run(
 ) -> None:
     recording = shifted(by_ns, tmp_path / "shifted")
     with pytest.raises(LiexError, match="shift them"):
-        measure_session(recording, Plan.load("mouse"), tmp_path)
+        run_session(recording, Plan.load("mouse"), tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["shifted"]
     assert any("shift them" in problem for problem in examine(recording)["problems"])
 

@@ -20,7 +20,6 @@ from liex_lab.behaviour.cohort import WHO
 from liex_lab.errors import SessionError
 from liex_lab.plan.subject import references_first
 from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.memory import uncollected
 from liex_lab.runtime.places import inside, safe_name, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_harmless
@@ -302,7 +301,7 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     report = session.metadata.get("plan", {}).get("report", {})  # older plans have none
     asked = {str(kind) for kind in report.get("figures", ())}
     paged = PAGES in asked or _PAGES_FILE in there
-    with uncollected(), drawing(), _one_pdf(folder if paged else None) as pages:
+    with drawing(), _one_pdf(folder if paged else None) as pages:
         for one in session_figures(session):
             if one.figure is None:
                 continue

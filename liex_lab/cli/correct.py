@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from liex_lab.cli.options import group_of_verbs, say
-from liex_lab.errors import SessionError, printable
+from liex_lab.cli.options import group_of_verbs, print_table, say
+from liex_lab.errors import SessionError
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
     from liex_lab.sessions import Session
     from liex_lab.sessions.corrections import Correction
 
-correct = group_of_verbs(
-    "Correct a session: kept beside it, applied whenever it is read; tables and report follow."
-)
+correct = group_of_verbs("Correct a session; corrections are kept in its folder and can be undone.")
 
 SessionPath = Annotated[
     Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
@@ -28,11 +26,12 @@ Author = Annotated[
     typer.Option(
         "--by",
         metavar="NAME",
-        help="Author of the correction; by default the account that is logged in.",
+        help="Author of the correction; default: the current account.",
     ),
 ]
 NewWord = Annotated[
-    bool, typer.Option("--new-word", help="The action need not be one of the ethogram's words.")
+    bool,
+    typer.Option("--new-word", help="Allow an action that is not in the ethogram's vocabulary."),
 ]
 
 
@@ -47,28 +46,28 @@ def flip(
     ],
     by: Author = "",
 ) -> None:
-    """Exchange head and tail in a span."""
+    """Exchange head and tail in a time span."""
     _say(session, ["flip", start_s, stop_s], by)
 
 
 @correct.command()
 def joint(
     session: SessionPath,
-    frame: Annotated[int, typer.Option("--frame", help="The frame's index, as in frames.parquet.")],
-    name: Annotated[str, typer.Option("--joint", help="The joint's name.")],
+    frame: Annotated[int, typer.Option("--frame", help="Frame index, as in frames.parquet.")],
+    name: Annotated[str, typer.Option("--joint", help="Name of the joint.")],
     to_mm: Annotated[
         tuple[float, float, float] | None,
-        typer.Option("--to-mm", metavar="X Y Z", help="Its position in the arena."),
+        typer.Option("--to-mm", metavar="X Y Z", help="Position in the arena frame, mm."),
     ] = None,
     to_px: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            "--to-px", metavar="U V", help="The pixel of the depth picture that it lies under."
+            "--to-px", metavar="U V", help="Pixel of the depth image under which the joint lies."
         ),
     ] = None,
     by: Author = "",
 ) -> None:
-    """Move a joint in one frame; the others follow as bones and limits allow."""
+    """Move a joint in one frame; the others follow within bone lengths and limits."""
     if (to_mm is None) == (to_px is None):
         raise SessionError(
             "a joint's place is given in one way: --to-mm X Y Z in the arena, or --to-px U V"
@@ -80,11 +79,9 @@ def joint(
 def bout(
     session: SessionPath,
     at_s: Annotated[
-        float | None, typer.Option("--at", metavar="S", help="A time within the bout to edit.")
+        float | None, typer.Option("--at", metavar="S", help="A time within the bout to edit, s.")
     ] = None,
-    action: Annotated[
-        str | None, typer.Option("--action", help="The action that the animal performs.")
-    ] = None,
+    action: Annotated[str | None, typer.Option("--action", help="Name of the action.")] = None,
     start_s: Annotated[
         float | None, typer.Option("--from", metavar="S", help="Seconds since the first frame.")
     ] = None,
@@ -95,13 +92,13 @@ def bout(
     labels: Annotated[
         Path | None,
         typer.Option(
-            "--labels", metavar="FILE", help="A whole ethogram: .csv, .parquet or .boris."
+            "--labels", metavar="FILE", help="Import a whole ethogram: .csv, .parquet or .boris."
         ),
     ] = None,
     new_word: NewWord = False,
     by: Author = "",
 ) -> None:
-    """Edit bouts: rename one, change its span, delete it, add one, or read a whole ethogram.
+    """Edit bouts: rename, move, delete or add one, or import a whole ethogram.
 
     Rename: --at, --action (the present name confirms it). New span: --at, --from, --to. Delete:
     --at, --delete. Add: --action, --from, --to. Whole ethogram: --labels.
@@ -130,11 +127,7 @@ def bout(
 
 @correct.command("list")
 def list_corrections(session: SessionPath) -> None:
-    """List every correction: who made it, when, and whether it was taken back."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
+    """List all corrections with author, time and state."""
     from liex_lab.sessions import Session
     from liex_lab.sessions.corrections import FOLDER, applies, read_log
 
@@ -144,13 +137,12 @@ def list_corrections(session: SessionPath) -> None:
         say(f"{opened.path} has no corrections")
         return
     standing = {entry.number for entry in log.standing}
-    table = Table("", "what", "by", "at", "")
+    rows = []
     for entry in log.entries:
-        what = f"{entry.undoes} taken back" if entry.what is None else str(entry.what)
+        what = f"{entry.undoes} taken back" if entry.what is None else entry.what
         state = "" if entry.what is None or entry.number in standing else "taken back"
-        row = (str(entry.number), what, entry.author, entry.made_at, state)
-        table.add_row(*(Text(printable(one)) for one in row))
-    Console().print(table)
+        rows.append((entry.number, what, entry.author, entry.made_at, state))
+    print_table(rows, "", "what", "by", "at", "")
     if log.standing and not applies(log, opened.path, opened.metadata):
         say(
             "note: they were made on another measurement of this recording and are not applied; "
@@ -162,11 +154,12 @@ def list_corrections(session: SessionPath) -> None:
 def undo(
     session: SessionPath,
     numbers: Annotated[
-        list[int] | None, typer.Argument(metavar="[NUMBER]...", help="By default the last one.")
+        list[int] | None,
+        typer.Argument(metavar="[NUMBER]...", help="Default: the last correction."),
     ] = None,
     by: Author = "",
 ) -> None:
-    """Take corrections back, by their numbers in `liex correct list`; `redo` makes them again."""
+    """Undo corrections by their numbers in `liex correct list`."""
     from liex_lab.sessions.corrections import read_log
 
     standing = read_log(_opened(session).path).standing
@@ -177,7 +170,7 @@ def undo(
 
 @correct.command()
 def redo(session: SessionPath, by: Author = "") -> None:
-    """Make the correction again that was taken back last."""
+    """Redo the correction that was undone last."""
     from liex_lab.sessions.corrections import read_log
 
     redoable = read_log(_opened(session).path).redoable
@@ -193,9 +186,7 @@ def redo(session: SessionPath, by: Author = "") -> None:
 
 @correct.command()
 def apply(session: SessionPath) -> None:
-    """Make the corrected tables and the report again, from what was measured and all corrections
-    that stand.
-    """
+    """Apply all corrections to the measured tables again, and regenerate the report."""
     _do(session, [], "")
 
 
@@ -206,23 +197,23 @@ def describe(
         typer.Argument(
             metavar="KEY=VALUE...",
             help="subject_id, group, cage, sex, batch, species, age or session_start_time; KEY= "
-            "removes it.",
+            "removes the value.",
         ),
     ],
     by: Author = "",
 ) -> None:
-    """Set subject, group, age and more: subject_id=m07 group=drug. Nothing is measured again."""
+    """Set facts about a session's animal, such as subject_id=m07 group=drug."""
     from liex_lab.api import describe_session
 
-    said = {}
+    given = {}
     for fact in facts:
         key, equals, value = fact.partition("=")
         if not equals:
             raise SessionError(f"a fact is written as KEY=VALUE, such as group=drug, not {fact!r}")
-        said[key.strip()] = value.strip()
+        given[key.strip()] = value.strip()
     with progress_bar() as progress:
-        describe_session(session, said, author=by, progress=progress)
-    for key, value in said.items():
+        describe_session(session, given, author=by, progress=progress)
+    for key, value in given.items():
         say(f"described: {key} is {value or 'not known'}")
     say(f"report:    {session / 'report.html'}")
 

@@ -9,7 +9,6 @@ import os
 import shlex
 import sys
 import traceback
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -33,21 +32,31 @@ from liex_lab.cli.options import (
     TopicName,
     WhichPlan,
     group_of_verbs,
+    load_plan,
+    print_table,
     region_setting,
     say,
     tell_numbers,
     to_json,
 )
-from liex_lab.cli.sessions import compare, convert, export, figures, pack, report, show
-from liex_lab.cli.study import cohort, dashboard, verify
+from liex_lab.cli.sessions import (
+    cohort,
+    compare,
+    convert,
+    dashboard,
+    export,
+    figures,
+    pack,
+    report,
+    show,
+    verify,
+)
 from liex_lab.errors import LiexError, MisfitError, printable
-from liex_lab.runtime.memory import why_short
-from liex_lab.runtime.places import is_full, why_full
-from liex_lab.runtime.processes import Ended, ending
+from liex_lab.runtime import memory, places, processes
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
-    from liex_lab.pipelines.arenas import ArenaOutcome
+    pass
 
 # exit code of internal errors (EX_SOFTWARE); errors that the user can correct are 1, usage errors 2
 FAULT = 70
@@ -62,7 +71,7 @@ _USERS_TO_MEND = {
 _RUST_LOG = "warn,re_log_encoding=off,re_sdk=off"
 
 app = group_of_verbs(
-    "Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out.", name="liex"
+    "Measure animal behaviour in depth recordings: 3D skeletons, a replay and tables.", name="liex"
 )
 app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
 app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
@@ -91,12 +100,12 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Depth recordings of animals in; 3D skeletons, a replay and behaviour tables out."""
+    """Measure animal behaviour in depth recordings: 3D skeletons, a replay and tables."""
 
 
 @app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
-    """Measure the bundled sample recording, to see the results."""
+    """Measure the bundled sample recording."""
     from liex_lab.api import export_video, run_demo
 
     with progress_bar() as progress:
@@ -105,7 +114,7 @@ def demo(out: OutFolder = Path()) -> None:
             video = f"video:   {export_video(session, progress=progress)}"
         except LiexError as error:  # the session is complete without it
             video = f"note: there is no video, for {error}"
-    _tell_session(session, video)
+    raise typer.Exit(_tell_session(session, video))
 
 
 @app.command(rich_help_panel=START)
@@ -116,46 +125,42 @@ def run(
     topic: TopicName = None,
     settings: Settings = None,
     no_depth: Annotated[
-        bool, typer.Option("--no-depth", help="Leave depth images out of the replay.")
+        bool, typer.Option("--no-depth", help="Omit depth images from the replay.")
     ] = False,
     candidates: Annotated[
         bool,
-        typer.Option(
-            "--candidates", help="Put every candidate pose of single frames into the replay."
-        ),
+        typer.Option("--candidates", help="Add all pose hypotheses of each frame to the replay."),
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a session that is already there.")
+        bool, typer.Option("--overwrite", help="Replace an existing session.")
     ] = False,
     workers: Annotated[
         int,
         typer.Option(
             "--workers",
             min=0,
-            help="Processes that share a long recording; 0: one for every two cores, four at most, "
-            "for more than 6,000 frames. The tables are the same.",
+            help="Processes for one long recording; 0: one per two cores, at most four, if it has "
+            "more than 6,000 frames. The tables do not depend on it.",
         ),
     ] = 1,
     accept: Annotated[
         bool,
         typer.Option(
-            "--accept", help="Measure even if the recording does not fit the plan's animal."
+            "--accept", help="Measure even if the recording does not show the plan's animal."
         ),
     ] = False,
 ) -> None:
-    """Turn a recording into a session folder: poses, behaviour tables, replay, report.
+    """Measure a recording: write poses, behaviour tables, a replay and a report.
 
-    Ends with one line on how it went; exit code 4 means: check this result.
-    Several arenas in one picture (`[[arenas]]` of the plan, or --set arenas=auto) become a session
+    The last line is the verdict; exits with code 4 if the session needs review.
+    Several arenas in one image (`[[arenas]]` of the plan, or --set arenas=auto) become one session
     each.
     """
-    from liex_lab.plan import Plan
-
     asked = [] if topic is None else [f"recording.topic={topic}"]
     asked += ["replay.depth=none"] * no_depth + ["replay.candidates=true"] * candidates
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: report a wrong plan or setting at once
-    chosen = Plan.load(plan or "mouse").with_settings(asked)
+    chosen = load_plan(plan, asked)
     from liex_lab.api import run_arenas, run_session
 
     measure = run_session if chosen.arenas is None else run_arenas
@@ -170,17 +175,24 @@ def run(
             progress=progress,
         )
     if isinstance(measured, Path):
-        _tell_session(measured)
-    else:
-        _tell_arenas(measured)
+        raise typer.Exit(_tell_session(measured))
+    codes = [0]
+    for one in measured:
+        say(f"arena {one.name}")
+        if one.error is not None:
+            typer.secho(f"liex: {printable(one.error)}", fg=typer.colors.RED, err=True)
+            codes.append(one.error.exit_code)
+        if one.session is not None:
+            codes.append(_tell_session(one.session))
+    raise typer.Exit(max(codes))
 
 
 @app.command(rich_help_panel=START)
 def doctor(
     recording: RecordingPath,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
+        float | None, typer.Option("--fps", help="Frame rate of a recording without timestamps.")
     ] = None,
     topic: TopicName = None,
     region: Annotated[
@@ -188,21 +200,19 @@ def doctor(
         typer.Option(
             "--region",
             metavar='"X,Y X,Y ..."',
-            help="Use only the inside of this polygon, corners in pixels, or 'circle X,Y R'; a "
-            "last word mm: millimetres on the floor.",
+            help="Use only the inside of a polygon (corners in pixels) or of 'circle X,Y R'; "
+            "append mm for millimetres on the floor.",
         ),
     ] = None,
     plan: WhichPlan = None,
     settings: Settings = None,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Print lens, sensor and scene as well.")
+        bool, typer.Option("--verbose", help="Also print lens, sensor and scene.")
     ] = False,
 ) -> None:
-    """Report what a recording contains, what is wrong with it, and which plan fits."""
-    from liex_lab.plan import Plan
-
+    """Report a recording's contents, its problems, and the plan that fits."""
     asked = [*(settings or []), *region_setting(region)]
-    chosen = Plan.load(plan or "mouse").with_settings(asked)
+    chosen = load_plan(plan, asked)
     stated = [*asked, *([] if fps is None else [f"recording.fps={fps}"])]
     options = [] if topic is None else ["--topic", topic]
     options += [word for setting in stated for word in ("--set", setting)]
@@ -236,51 +246,49 @@ app.command(rich_help_panel=MODELS)(train)
 def suggest(
     session: SessionPath,
     model: Annotated[
-        str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
+        str | None, typer.Option("--actions", metavar="FILE", help="Action model, .skops.")
     ] = None,
     n: Annotated[int, typer.Option("--n", min=1, help="Number of suggestions.")] = 10,
-    video: Annotated[bool, typer.Option("--video", help="Make a clip of each.")] = False,
+    video: Annotated[
+        bool, typer.Option("--video", help="Write a video clip of each suggestion.")
+    ] = False,
 ) -> None:
-    """List the parts of a session that are most worth labelling: where the recogniser is least
-    certain.
-    """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
+    """List the parts of a session to label next: those the recogniser is least sure of."""
     from liex_lab.pipelines.training.action_model import suggest as job
     from liex_lab.sessions import Session
     from liex_lab.sessions.session import found_video, stretch
 
-    rows = list(job(session, model=model, n=n).itertuples())
+    suggestions = list(job(session, model=model, n=n).itertuples())
     if video:
         from liex_lab.api import export_video
 
-        for row in rows:
-            export_video(session, start_s=row.start_s, stop_s=row.stop_s, overwrite=True)
+        for one in suggestions:
+            export_video(session, start_s=one.start_s, stop_s=one.stop_s, overwrite=True)
     opened = Session.open(session)
-    table = Table("from (s)", "to (s)", "taken for", "or else", "doubt", "clip")
-    for row in rows:
-        numbers = (f"{row.start_s:.2f}", f"{row.stop_s:.2f}", f"{row.uncertainty:.2f}")
-        words = (Text(printable(row.guess)), Text(printable(row.or_else)))
-        clip = found_video(opened, stretch(row.start_s, row.stop_s))
-        name = Text("" if clip is None else printable(clip.name))
-        table.add_row(*numbers[:2], *words, numbers[2], name)
-    Console().print(table)
+    rows = []
+    for one in suggestions:
+        clip = found_video(opened, stretch(one.start_s, one.stop_s))
+        span = (f"{one.start_s:.2f}", f"{one.stop_s:.2f}")
+        name = "" if clip is None else clip.name
+        rows.append((*span, one.guess, one.or_else, f"{one.uncertainty:.2f}", name))
+    print_table(rows, "from (s)", "to (s)", "taken for", "or else", "doubt", "clip")
 
 
 @app.command(rich_help_panel=RECORDINGS)
 def live(
     source: Annotated[
-        str, typer.Argument(metavar="SOURCE", help="A file or folder being written, or HOST:PORT.")
+        str,
+        typer.Argument(
+            metavar="SOURCE", help="A file or folder that is being written, or HOST:PORT."
+        ),
     ],
     plan: PlanName = "mouse",
     settings: Settings = None,
     replay: Annotated[
-        bool, typer.Option("--replay", help="Send a finished recording at its own pace.")
+        bool, typer.Option("--replay", help="Play back a finished recording at its own pace.")
     ] = False,
     to: Annotated[
-        str, typer.Option("--to", help="viewer, the address of one, or a file .rrd.")
+        str, typer.Option("--to", help="viewer, the address of a viewer, or an .rrd file.")
     ] = "viewer",
     patience_s: Annotated[
         float,
@@ -291,9 +299,7 @@ def live(
     json_file: JsonFile = None,
 ) -> None:
     """Show skeletons in Rerun during a recording, and measure their latency."""
-    from liex_lab.plan import Plan
-
-    chosen = Plan.load(plan).with_settings(settings or [])
+    chosen = load_plan(plan, settings or [])
     from liex_lab.api import follow_live
 
     with progress_bar() as progress:
@@ -315,16 +321,12 @@ app.command(rich_help_panel=START)(show)
 
 @app.command(rich_help_panel=MODELS)
 def info(
-    plan: Annotated[
-        str | None, typer.Option("--plan", help="Print this plan, to copy and change it.")
-    ] = None,
+    plan: Annotated[str | None, typer.Option("--plan", help="Print this plan as TOML.")] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Show every package, and every line of the models' cards.")
+        bool, typer.Option("--all", help="Show all package versions and model cards.")
     ] = False,
 ) -> None:
-    """Show versions, bundled plans and models; `liex info --plan mouse > my-plan.toml` copies a
-    plan.
-    """
+    """Show versions, bundled plans and models; `liex info --plan mouse` prints a plan."""
     from liex_lab.plan import Plan, known_plans
 
     if plan is not None:
@@ -344,7 +346,7 @@ def info(
             f"model {name}": f"sha256 {str(card.get('sha256', 'unknown'))[:16]}"
             for name, card in models.items()
         }
-        tell_numbers(facts, None)
+        tell_numbers(facts)
         say("`liex info --all` lists every package and how the models were made")
         return
     facts |= {
@@ -352,7 +354,7 @@ def info(
         for name, card in models.items()
         for key, value in card.items()
     }
-    tell_numbers(facts, None)
+    tell_numbers(facts)
 
 
 def main() -> None:
@@ -363,18 +365,18 @@ def main() -> None:
     """
     os.environ.setdefault("RUST_LOG", _RUST_LOG)
     atexit.register(gc.freeze)  # else two collections at exit take a second
-    if told := liex_lab._KERNELS_TOLD:
-        typer.echo(f"note: {printable(told)}", err=True)
+    if notice := liex_lab._KERNELS_NOTICE:
+        typer.echo(f"note: {printable(notice)}", err=True)
     try:
-        with ending():
+        with processes.ending():
             app()
-    except Ended as ended:
+    except processes.Ended as ended:
         _fail(str(ended), ended.exit_code)
     except LiexError as error:
         _fail(str(error), error.exit_code)
     except OSError as error:
-        if is_full(error):
-            _fail(f"{why_full(error)}; make room there and run the same command again")
+        if places.is_full(error):
+            _fail(f"{places.why_full(error)}; make room there and run the same command again")
         if error.errno not in _USERS_TO_MEND:
             _fault(error)
         where = f" {error.filename}" if error.filename else ""
@@ -392,34 +394,14 @@ def _fail(sentence: str, code: int = 1) -> NoReturn:
 
 
 def _fault(error: Exception) -> NoReturn:
-    if short := why_short(error):
+    if short := memory.why_short(error):
         _fail(short)
     traceback.print_exc()
     _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
 
 
-def _tell_arenas(outcomes: Sequence[ArenaOutcome]) -> None:
-    """Print the result of each arena; exits with the largest of their exit codes."""
-    code = 0
-    for one in outcomes:
-        say(f"arena {one.name}")
-        if one.error is not None:
-            typer.secho(f"liex: {printable(one.error)}", fg=typer.colors.RED, err=True)
-            code = max(code, one.error.exit_code)
-        if one.session is not None:
-            code = max(code, _told_session(one.session))
-    if code:
-        raise typer.Exit(code)
-
-
-def _tell_session(session: Path, further: str = "") -> None:
-    """Print the session's path and result; exits with code 4 if the session needs review."""
-    if code := _told_session(session, further):
-        raise typer.Exit(code)
-
-
-def _told_session(session: Path, further: str = "") -> int:
-    """Print the session's path and result; returns the exit code."""
+def _tell_session(session: Path, further: str = "") -> int:
+    """Print a session's path and result; returns the exit code, 4 if it needs review."""
     from liex_lab.sessions.folder import folder_bytes, megabytes, taken_from
     from liex_lab.sessions.verdict import read_verdict
 

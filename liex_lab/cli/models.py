@@ -33,48 +33,44 @@ def train(
         str,
         typer.Argument(
             metavar="ANIMAL",
-            help="fish, mouse, hand, a skeleton's .toml; or: actions, tracking, shape.",
+            help="fish, mouse, hand or a skeleton's .toml; or actions, tracking or shape.",
         ),
     ],
     variant: VariantName = "default",
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="The model file, .npz (of actions: .skops)."),
+        typer.Option("--out", metavar="FILE", help="Model file, .npz (.skops for actions)."),
     ] = None,
-    workers: Annotated[
-        int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all of them.")
-    ] = 0,
+    workers: Annotated[int, typer.Option("--workers", min=0, help="CPU cores to use; 0: all.")] = 0,
     n_images: Annotated[
         int | None,
-        typer.Option("--images", min=512, help="Pictures to train on, for a quick look."),
+        typer.Option("--images", min=512, help="Number of training images, for a quick trial."),
     ] = None,
     of: Annotated[
         str,
-        typer.Option("--animal", help="Of `train actions`, `tracking` and `shape`: which animal."),
+        typer.Option("--animal", help="Animal of `train actions`, `tracking` and `shape`."),
     ] = "mouse",
     sessions: Annotated[
         list[Path] | None,
-        typer.Option("--session", help="Of `train actions`: a labelled session; repeatable."),
+        typer.Option("--session", help="`train actions`: a labelled session; repeatable."),
     ] = None,
     labels: Annotated[
         list[Path] | None,
         typer.Option(
             "--labels",
             metavar="FILE",
-            help="Of `train actions`: .csv, .parquet, or .boris; repeatable.",
+            help="`train actions`: labels, .csv, .parquet or .boris; repeatable.",
         ),
     ] = None,
     pose_model: Annotated[
         str | None,
-        typer.Option(
-            "--model", metavar="FILE", help="Of `train actions`: the model that measures poses."
-        ),
+        typer.Option("--model", metavar="FILE", help="`train actions`: pose model."),
     ] = None,
     particles: Annotated[
         bool,
         typer.Option(
             "--particles",
-            help="Of `train tracking`: search the noise of the paper's Algorithm 3 instead.",
+            help="`train tracking`: search the noise of the paper's Algorithm 3 instead.",
         ),
     ] = False,
     n_frames: Annotated[
@@ -82,13 +78,12 @@ def train(
         typer.Option(
             "--frames",
             min=40,
-            help="Of `train tracking --particles`: the first frames of each sequence alone.",
+            help="`train tracking --particles`: number of frames of each sequence.",
         ),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Train an animal's model on rendered depth images; every run gives the same model, byte for
-    byte.
+    """Train a model on rendered depth images; training is deterministic.
 
     `liex train actions` makes the model that names actions: from sessions that people labelled, or,
     without any, from virtual animals that act. `liex train tracking` measures how far off an
@@ -97,14 +92,32 @@ def train(
     """
     if animal == "actions":
         _train_actions(of, out, sessions or (), labels or (), pose_model, json_file)
-    elif animal == "tracking" and particles:
-        _search_particles(of, n_frames, json_file or out)
-    elif animal == "tracking":
-        _train_tracking(of, out or Path("tunings.toml"), workers)
-    elif animal == "shape":
-        _train_shape(of, out or Path(f"{of}-shapes.npz"), workers)
+        return
+    with progress_bar() as progress:
+        if animal == "tracking" and particles:
+            from liex_lab.pipelines.evaluation.tracking import search_noise
+
+            found = search_noise(of, n_frames=n_frames, progress=progress)
+        elif animal == "tracking":
+            from liex_lab.pipelines.training.motion_model import train_tracking
+
+            tunings = out or Path("tunings.toml")
+            made = f"tunings: {train_tracking(of, tunings, workers=workers, progress=progress)}"
+        elif animal == "shape":
+            from liex_lab.pipelines.training.shape_model import train_shape
+
+            shapes = out or Path(f"{of}-shapes.npz")
+            made = f"shapes: {train_shape(of, shapes, workers=workers, progress=progress)}"
+        else:
+            from liex_lab.pipelines.training.pose_model import train_model
+
+            how: Result = {"workers": workers, "n_images": n_images, "progress": progress}
+            file = out or Path(f"{Path(animal).stem}.npz")
+            made = f"model: {train_model(animal, variant, file, **how)}"
+    if animal == "tracking" and particles:
+        tell_numbers(found, json_file or out)
     else:
-        _train_pose(animal, variant, out or Path(f"{Path(animal).stem}.npz"), workers, n_images)
+        say(made)
 
 
 def _train_actions(
@@ -132,57 +145,18 @@ def _train_actions(
     say(f"model: {model}")
 
 
-def _search_particles(animal: str, n_frames: int | None, json_file: Path | None) -> None:
-    from liex_lab.pipelines.evaluation.tracking import search_noise
-
-    with progress_bar() as progress:
-        found = search_noise(animal, n_frames=n_frames, progress=progress)
-    tell_numbers(found, json_file)
-
-
-def _train_tracking(animal: str, out: Path, workers: int) -> None:
-    from liex_lab.pipelines.training.motion_model import train_tracking
-
-    with progress_bar() as progress:
-        table = train_tracking(animal, out, workers=workers, progress=progress)
-    say(f"tunings: {table}")
-
-
-def _train_shape(animal: str, out: Path, workers: int) -> None:
-    from liex_lab.pipelines.training.shape_model import train_shape
-
-    with progress_bar() as progress:
-        shapes = train_shape(animal, out, workers=workers, progress=progress)
-    say(f"shapes: {shapes}")
-
-
-def _train_pose(animal: str, variant: str, out: Path, workers: int, n_images: int | None) -> None:
-    from liex_lab.pipelines.training.pose_model import train_model
-
-    with progress_bar() as progress:
-        model = train_model(
-            animal, variant, out, workers=workers, n_images=n_images, progress=progress
-        )
-    say(f"model: {model}")
-
-
 # `liex evaluate`: reproduces every published number.
 
 
-evaluate = group_of_verbs("Measure the method; --json FILE keeps the numbers.")
+evaluate = group_of_verbs("Measure accuracy and speed; --json FILE saves the numbers.")
 Result = dict[str, Any]
 OwnModel = Annotated[
-    str | None, typer.Option("--model", metavar="FILE", help="A model of your own, .npz.")
+    str | None, typer.Option("--model", metavar="FILE", help="Your own model, .npz.")
 ]
 
 
-def show_numbers(result: Result) -> None:
-    """Print all numbers."""
-    tell_numbers(result, None)
-
-
 def benchmark(
-    name: str, show: Callable[[Result], None] = show_numbers
+    name: str, show: Callable[[Result], None] = tell_numbers
 ) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """Register a function as the command `liex evaluate NAME`; its parameters are the options.
 
@@ -215,7 +189,7 @@ def benchmark(
 def show_poses(result: Result) -> None:
     """Print the numbers of a split; for other-build, a row for each kind of build."""
     if "usual" not in result:
-        tell_numbers(result, None)
+        tell_numbers(result)
         return
     rows = {}
     for kind in ("other", "usual"):
@@ -232,7 +206,8 @@ def evaluate_pose(
     variant: RowName = "default",
     model: OwnModel = None,
     n_frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="Only this many frames of the split.")
+        int | None,
+        typer.Option("--frames", min=1, help="Number of frames of the split; default: all."),
     ] = None,
     spine_mm: Annotated[
         float | None,
@@ -242,14 +217,12 @@ def evaluate_pose(
     ] = None,
     sealed: Annotated[
         bool,
-        typer.Option(
-            "--sealed", help="Measure the sealed part of other-build; never develop on it."
-        ),
+        typer.Option("--sealed", help="Use the held-out part of other-build; not for development."),
     ] = False,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure joint errors on a fixed split of rendered frames; of other-build on whole tracks."""
+    """Measure joint errors on a fixed split of rendered frames (other-build: whole tracks)."""
     if split == "other-build":
         from liex_lab.pipelines.evaluation.pose import evaluate_builds
 
@@ -260,8 +233,15 @@ def evaluate_pose(
         raise LiexError("--sealed belongs to the split other-build; leave it out")
     from liex_lab.pipelines.evaluation.pose import evaluate_pose as measure
 
-    how: Result = {"model": model, "n_frames": n_frames, "spine_mm": spine_mm}
-    return measure(animal, split, variant, **how, progress=progress)
+    return measure(
+        animal,
+        split,
+        variant,
+        model=model,
+        n_frames=n_frames,
+        spine_mm=spine_mm,
+        progress=progress,
+    )
 
 
 @benchmark("speed")
@@ -269,16 +249,12 @@ def evaluate_speed(
     animal: AnimalName = "mouse",
     recordings: Annotated[
         bool,
-        typer.Option(
-            "--recordings", help="Measure how fast recordings of each format are read instead."
-        ),
+        typer.Option("--recordings", help="Measure the reading speed of each format instead."),
     ] = False,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure frames per second on one and two cores by stage, and the ratio to the paper's
-    variant.
-    """
+    """Measure frames per second by stage on one and two cores, relative to the paper's variant."""
     if recordings:
         from liex_lab.pipelines.evaluation.speed import evaluate_recordings
 
@@ -292,12 +268,12 @@ def evaluate_speed(
 def evaluate_sizes(
     animal: AnimalName = "mouse",
     n_frames: Annotated[
-        int | None, typer.Option("--frames", min=1, help="Only this many frames for each size.")
+        int | None, typer.Option("--frames", min=1, help="Number of frames per size; default: all.")
     ] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure joint errors of animals 45 to 100 mm long, with their size estimated, not given."""
+    """Measure joint errors of animals 45 to 100 mm long, with estimated sizes."""
     from liex_lab.pipelines.evaluation.pose import evaluate_sizes as measure
 
     return measure(animal, n_frames=n_frames, progress=progress)
@@ -305,12 +281,12 @@ def evaluate_sizes(
 
 @evaluate.command("tables", epilog="\n\n".join(["What differs from the paper:", *DEVIATIONS, HAND]))
 def evaluate_tables(
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", help="The folder for tables and figures.")
-    ],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder.")],
     animals: Annotated[
         list[str] | None,
-        typer.Option("--animal", help="fish, mouse or hand; repeatable; all that have a model."),
+        typer.Option(
+            "--animal", help="fish, mouse or hand; repeatable; default: all with a model."
+        ),
     ] = None,
     n_frames: Annotated[
         int | None,
@@ -323,9 +299,7 @@ def evaluate_tables(
     ] = None,
     quick: Annotated[
         bool,
-        typer.Option(
-            "--quick", help="Check within minutes that everything runs; the numbers mean nothing."
-        ),
+        typer.Option("--quick", help="Test the code within minutes; the numbers are meaningless."),
     ] = False,
     fresh: Annotated[
         bool,
@@ -354,16 +328,14 @@ def evaluate_tables(
     ] = False,
     without: Annotated[
         list[str] | None,
-        typer.Option(
-            "--without", help="Leave out what other verbs measure: tracking or actions; repeatable."
-        ),
+        typer.Option("--without", help="Skip tracking or actions; repeatable."),
     ] = None,
     nyu: Annotated[
         Path | None,
-        typer.Option("--nyu", metavar="FOLDER", help="Count the NYU hand data as well."),
+        typer.Option("--nyu", metavar="FOLDER", help="Include the NYU hand data in this folder."),
     ] = None,
 ) -> None:
-    """Make every table and figure of the paper on one page, DIR/index.html, measured or kept."""
+    """Write all tables and figures of the paper to one page, DIR/index.html."""
     from liex_lab.api import run_tables
 
     with progress_bar() as progress:
@@ -387,22 +359,24 @@ def evaluate_tables(
 def evaluate_actions(
     animal: AnimalName = "fish",
     model: Annotated[
-        str | None, typer.Option("--actions", metavar="FILE", help="An action model, .skops.")
+        str | None, typer.Option("--actions", metavar="FILE", help="Action model, .skops.")
     ] = None,
     pose_model: Annotated[
         str | None,
-        typer.Option("--model", metavar="FILE", help="The model that measures poses, .npz."),
+        typer.Option("--model", metavar="FILE", help="Pose model, .npz."),
     ] = None,
     minutes: Annotated[
-        float, typer.Option("--minutes", min=1.0, help="Minutes of uncut test recordings.")
+        float,
+        typer.Option("--minutes", min=1.0, help="Length of the uncut test recordings, minutes."),
     ] = 30.0,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", help="Draw the confusion matrices there.")
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Draw confusion matrices into this folder."),
     ] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Score the paper's action recogniser and ours, on cut-out sequences and on uncut recordings.
+    """Score the paper's action recogniser and ours on cut sequences and uncut recordings.
 
     The recordings are rendered and measured first, which takes about half an hour for all 30
     minutes on two cores. Measured recordings are kept in the cache folder (LIEX_CACHE), so that a
@@ -410,18 +384,25 @@ def evaluate_actions(
     """
     from liex_lab import api
 
-    how: Result = {"model": model, "pose_model": pose_model, "minutes": minutes}
-    figure = None if out is None else out / f"{animal}_confusion.png"
-    return api.evaluate_actions(animal, **how, figure=figure, progress=progress)
+    return api.evaluate_actions(
+        animal,
+        model=model,
+        pose_model=pose_model,
+        minutes=minutes,
+        figure=out and out / f"{animal}_confusion.png",
+        progress=progress,
+    )
 
 
 @benchmark("tracking")
 def evaluate_tracking(
     animal: AnimalName = "mouse",
-    sequence: Annotated[str, typer.Option("--sequence", help="easy or hard.")] = "hard",
+    sequence: Annotated[
+        str, typer.Option("--sequence", help="Test sequence: easy or hard.")
+    ] = "hard",
     model: OwnModel = None,
     n_frames: Annotated[
-        int | None, typer.Option("--frames", min=40, help="A sequence of this many frames.")
+        int | None, typer.Option("--frames", min=40, help="Number of frames of the sequence.")
     ] = None,
     paper: Annotated[
         bool,
@@ -432,100 +413,100 @@ def evaluate_tracking(
         ),
     ] = False,
     figure: Annotated[
-        Path | None, typer.Option("--figure", metavar="PNG", help="Draw error over time.")
+        Path | None, typer.Option("--figure", metavar="PNG", help="Draw the error over time.")
     ] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure joint errors over a sequence: single frames, Algorithm 3 on our parts, and the
-    default tracker online and smoothed.
-    """
+    """Measure joint errors over a sequence: single frames, Algorithm 3, and the default tracker."""
     from liex_lab import api
 
-    how: Result = {"model": model, "paper": paper, "n_frames": n_frames, "figure": figure}
-    return api.evaluate_tracking(animal, sequence, **how, progress=progress)
+    return api.evaluate_tracking(
+        animal,
+        sequence,
+        model=model,
+        paper=paper,
+        n_frames=n_frames,
+        figure=figure,
+        progress=progress,
+    )
 
 
-def show_scenes(result: Result) -> None:
-    """Print a row for each scene."""
-    tell_rows(result["rows"])
-
-
-@benchmark("scenes", show_scenes)
+@benchmark("scenes", lambda result: tell_rows(result["rows"]))
 def evaluate_scenes(
     only: Annotated[
-        str | None, typer.Option("--only", metavar="NAME,...", help="Only these scenes.")
+        str | None, typer.Option("--only", metavar="NAME,...", help="Measure only these scenes.")
     ] = None,
     n_frames: Annotated[
-        int, typer.Option("--frames", min=20, help="Frames of each recording.")
+        int, typer.Option("--frames", min=20, help="Number of frames of each recording.")
     ] = 300,
     n_recordings: Annotated[
         int,
-        typer.Option(
-            "--recordings", min=1, help="Recordings of each scene, each of another animal."
-        ),
+        typer.Option("--recordings", min=1, help="Recordings per scene, each of another animal."),
     ] = 1,
     sealed: Annotated[
         bool,
-        typer.Option("--sealed", help="Use the sealed split; never develop on it."),
+        typer.Option("--sealed", help="Use the held-out split; not for development."),
     ] = False,
     pictures: Annotated[
         Path | None,
-        typer.Option("--pictures", metavar="DIR", help="Draw frames of each scene there."),
+        typer.Option(
+            "--pictures", metavar="DIR", help="Draw frames of each scene into this folder."
+        ),
     ] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure rendered scenes of a lab: frames found, joint errors, and frames that are wrong but
-    trusted.
-    """
+    """Measure rendered lab scenes: found frames, joint errors, and errors not flagged."""
     from liex_lab import api
 
-    names = [name.strip() for name in only.split(",")] if only else []
-    how: Result = {"n_frames": n_frames, "n_recordings": n_recordings, "sealed": sealed}
-    return api.evaluate_scenes(names, **how, pictures=pictures, progress=progress)
+    return api.evaluate_scenes(
+        [name.strip() for name in only.split(",")] if only else [],
+        n_frames=n_frames,
+        n_recordings=n_recordings,
+        sealed=sealed,
+        pictures=pictures,
+        progress=progress,
+    )
 
 
 @benchmark("live")
 def evaluate_live(
     animal: AnimalName = "fish",
     n_frames: Annotated[
-        int, typer.Option("--frames", min=200, help="Number of frames sent at the camera's pace.")
+        int, typer.Option("--frames", min=200, help="Number of frames, sent at the camera's rate.")
     ] = 1500,
     rate_hz: Annotated[
         float | None,
-        typer.Option("--fps", min=1.0, max=1000.0, help="Frames per second, instead of its own."),
+        typer.Option("--fps", min=1.0, max=1000.0, help="Frame rate, instead of the recording's."),
     ] = None,
     n_cameras: Annotated[
-        int, typer.Option("--cameras", min=1, max=16, help="Number of cameras at once.")
+        int, typer.Option("--cameras", min=1, max=16, help="Number of simultaneous cameras.")
     ] = 1,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure the latency of skeletons while a virtual animal is filmed."""
+    """Measure the latency of live tracking of a virtual animal."""
     from liex_lab.pipelines.evaluation.speed import evaluate_live as measure
 
-    how: Result = {"n_frames": n_frames, "rate_hz": rate_hz, "n_cameras": n_cameras}
-    return measure(animal, **how, progress=progress)
+    return measure(
+        animal, n_frames=n_frames, rate_hz=rate_hz, n_cameras=n_cameras, progress=progress
+    )
 
 
 @benchmark("statistics")
 def evaluate_statistics(
     n_studies: Annotated[
-        int, typer.Option("--studies", min=20, help="Simulated studies of each kind.")
+        int, typer.Option("--studies", min=20, help="Number of simulated studies of each kind.")
     ] = 2000,
     effect: Annotated[
         float,
-        typer.Option(
-            "--effect", help="Effect in the studies for the power, in sd between animals."
-        ),
+        typer.Option("--effect", help="Effect size for the power, in SD between animals."),
     ] = 1.0,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure how often the comparison of groups is wrong on studies without an effect, and how
-    often it finds one.
-    """
+    """Measure false positives and power of group comparisons on simulated studies."""
     from liex_lab.pipelines.evaluation.statistics import evaluate_statistics as measure
 
     return measure(n_studies, effect, progress=progress)
@@ -540,9 +521,7 @@ def evaluate_report(
     *,
     progress: Progress,
 ) -> Result:
-    """Measure time and memory of the report of a long session: SESSION repeated until it is so
-    long.
-    """
+    """Measure time and memory of a long session's report; SESSION is repeated to that length."""
     from liex_lab.pipelines.evaluation.scale import evaluate_report as measure
 
     return measure(session, minutes, progress=progress)
@@ -552,7 +531,7 @@ def show_hands(result: Result) -> None:
     """Print one line for each method."""
     from liex_lab.pipelines.evaluation import nyu
 
-    tell_numbers(nyu.in_short(result), None)
+    tell_numbers(nyu.in_short(result))
 
 
 @benchmark("nyu", show_hands)
@@ -562,18 +541,14 @@ def evaluate_nyu(
         typer.Option(
             "--reference",
             metavar="DIR",
-            help="Labels, published answers and frames of the NYU data.",
+            help="Folder with labels, published results and frames of the NYU data.",
         ),
     ],
-    model: Annotated[
-        str | None, typer.Option("--model", help="A hand model of your own, .npz.")
-    ] = None,
+    model: Annotated[str | None, typer.Option("--model", help="Your own hand model, .npz.")] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Compare published answers and ours on hands by the NYU protocol: 14 points, the root given
-    and estimated.
-    """
+    """Compare published results and ours on hands by the NYU protocol (14 points)."""
     from liex_lab.pipelines.evaluation.nyu import evaluate_nyu as measure
 
     return measure(reference, model=model, progress=progress)
@@ -593,30 +568,27 @@ def evaluate_motion(
         typer.Option(
             "--reference",
             metavar="NPZ",
-            help="Points of a real mouse: points_mm (n, P, 3), names (P,), perhaps clip_frames.",
+            help="Points of a real mouse: points_mm (n, P, 3), names (P,), optionally clip_frames.",
         ),
     ],
     names: Annotated[
         str,
         typer.Option(
-            "--points", metavar="NAME,...", help="The five from the tail's base to the nose."
+            "--points", metavar="NAME,...", help="The five points from tail base to nose."
         ),
     ] = "TTI,Trunk,Spine,Neck,Nose",
-    up: Annotated[str, typer.Option("--up", help="x, y, z, -x, -y or -z: what points up.")] = "z",
+    up: Annotated[str, typer.Option("--up", help="Upward axis: x, y, z, -x, -y or -z.")] = "z",
     rate_hz: Annotated[
         float | None,
-        typer.Option(
-            "--rate", min=1.0, help="Frames per second; without it no speeds are compared."
-        ),
+        typer.Option("--rate", min=1.0, help="Frame rate; without it, speeds are not compared."),
     ] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Compare posture and movement of a real mouse with the virtual one: 5, 50, 95 % quantiles."""
+    """Compare posture and movement of a real and the virtual mouse by quantiles."""
     from liex_lab.pipelines.evaluation.motion import evaluate_motion as measure
 
-    points = names.split(",")
-    return measure(reference, names=points, up=up, rate_hz=rate_hz, progress=progress)
+    return measure(reference, names=names.split(","), up=up, rate_hz=rate_hz, progress=progress)
 
 
 @benchmark("reference")
@@ -624,14 +596,12 @@ def evaluate_reference(
     session: SessionPath,
     reference: Annotated[
         Path,
-        typer.Option(
-            "--reference", metavar="CSV", help="The reference's table, one row per frame."
-        ),
+        typer.Option("--reference", metavar="CSV", help="Reference table, one row per frame."),
     ],
     *,
     progress: Progress,
 ) -> Result:
-    """Compare a session with what another program measured in the same recording."""
+    """Compare a session with another program's measurement of the recording."""
     from liex_lab.pipelines.evaluation.pose import evaluate_reference as measure
 
     return measure(session, reference)
@@ -640,19 +610,18 @@ def evaluate_reference(
 @benchmark("scale")
 def evaluate_scale(
     n_frames: Annotated[
-        int, typer.Option("--frames", min=2000, help="Frames of each virtual recording.")
+        int, typer.Option("--frames", min=2000, help="Number of frames of each virtual recording.")
     ] = 3000,
     minutes: Annotated[
         list[float] | None,
         typer.Option(
-            "--minutes", min=0.1, help="Measure memory for a recording of this length; repeatable."
+            "--minutes", min=0.1, help="Length of a recording whose memory is measured; repeatable."
         ),
     ] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure the cost of a study: sessions per hour by workers, memory by length, and where
-    the time goes.
+    """Measure the cost of a study: sessions per hour, memory, and time by step.
 
     Takes about eleven minutes on two cores, and needs a machine without other work; with --minutes
     10 alone, half of that.

@@ -3,39 +3,46 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
 from liex_lab.errors import printable
 
+if TYPE_CHECKING:
+    from liex_lab.plan import Plan
+
 RecordingPath = Annotated[
-    Path, typer.Argument(metavar="RECORDING", help="A file, a folder, or synthetic:walk.")
+    Path,
+    typer.Argument(
+        metavar="RECORDING", help="A file, a folder, or a virtual recording such as synthetic:walk."
+    ),
 ]
 SessionPath = Annotated[
     Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
 ]
 PlanName = Annotated[
-    str, typer.Option("--plan", help="A bundled plan (`liex info` lists them), or a .toml file.")
+    str, typer.Option("--plan", help="A bundled plan (see `liex info`) or a .toml file.")
 ]
 WhichPlan = Annotated[
     str | None,
     typer.Option(
-        "--plan", help="A bundled plan, or a .toml file; by default the bundled one that fits."
+        "--plan", help="A bundled plan or a .toml file; default: the bundled plan that fits."
     ),
 ]
 OutFolder = Annotated[
-    Path, typer.Option("--out", metavar="DIR", help="The folder in which NAME.liex is made.")
+    Path, typer.Option("--out", metavar="DIR", help="Output folder, in which NAME.liex is created.")
 ]
 TopicName = Annotated[
     str | None,
-    typer.Option("--topic", help="The topic of an MCAP file or ROS bag, where several hold depth."),
+    typer.Option("--topic", help="Depth topic of an MCAP file or ROS bag with several."),
 ]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change a value of the plan; repeatable."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a setting of the plan; repeatable."),
 ]
 AnimalName = Annotated[
     str, typer.Option("--animal", help="fish, mouse, hand, or a skeleton's .toml file.")
@@ -44,7 +51,7 @@ VariantName = Annotated[
     str,
     typer.Option(
         "--variant",
-        help="default, or paper: the paper's; `liex evaluate tables --help` lists what differs.",
+        help="default or paper; `liex evaluate tables --help` lists the differences.",
     ),
 ]
 RowName = Annotated[
@@ -52,7 +59,7 @@ RowName = Annotated[
     typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn."),
 ]
 JsonFile = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Write the numbers into this file.")
+    Path | None, typer.Option("--json", metavar="FILE", help="Also write the numbers to this file.")
 ]
 
 
@@ -92,25 +99,36 @@ def region_setting(region: str | None) -> list[str]:
     return [f'arena.region={{polygon = {corners}, unit = "mm"}}']
 
 
+def load_plan(plan: str | None, settings: Sequence[str]) -> Plan:
+    """The named plan, or the usual one, with settings: an error in them is raised at once."""
+    from liex_lab.plan import Plan
+
+    return Plan.load(plan or "mouse").with_settings(settings)
+
+
 def say(text: object) -> None:
     """Print a line, with unprintable characters escaped."""
     typer.echo(printable(text))
 
 
-def tell_numbers(result: dict[str, Any], json_file: Path | None) -> None:
-    """Print numbers as a table, and write them as JSON if a file is given."""
-    if json_file is not None:
-        keep_numbers(result, json_file)
+def print_table(rows: Iterable[Iterable[object]], *headings: str) -> None:
+    """Print a table of texts, with unprintable characters escaped."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(show_header=False)
-    for name, value in result.items():
-        said = to_json(value) if isinstance(value, dict) else str(value)
-        said = f"{value:.4g}" if isinstance(value, float) else said
-        table.add_row(Text(printable(name)), Text(printable(said)))
+    table = Table(*headings, show_header=bool(headings))
+    for row in rows:
+        table.add_row(*(Text(printable(cell)) for cell in row))
     Console().print(table)
+
+
+def tell_numbers(result: dict[str, Any], json_file: Path | None = None) -> None:
+    """Print numbers as a table, and write them as JSON if a file is given."""
+    if json_file is not None:
+        keep_numbers(result, json_file)
+    shown = {k: to_json(v) if isinstance(v, dict) else v for k, v in result.items()}
+    print_table((k, f"{v:.4g}" if isinstance(v, float) else v) for k, v in shown.items())
 
 
 def tell_rows(rows: dict[str, dict[str, Any]]) -> None:
@@ -153,19 +171,16 @@ def tell_scores(report: dict[str, Any]) -> None:
         for name, value in report.items():
             typer.echo(f"{name}: {value}")
         return
-    from rich.console import Console
-    from rich.table import Table
-
     typer.echo(
         "Each animal's actions were recognised by what the others taught: macro F1 of the frames "
         f"{report['macro_f1']:.2f}, F1 of bouts that overlap by half {report['segment_f1_50']:.2f}."
     )
-    table = Table("action", "bouts", "F1", "of what was called so, is", "of what is, found")
-    for word, one in report["per_action"].items():
-        if "bouts" in one:
-            shares = (f"{one['precision']:.0%}", f"{one['recall']:.0%}")
-            table.add_row(word, str(one["bouts"]), f"{one['f1']:.2f}", *shares)
-    Console().print(table)
+    rows = [
+        (word, one["bouts"], f"{one['f1']:.2f}", f"{one['precision']:.0%}", f"{one['recall']:.0%}")
+        for word, one in report["per_action"].items()
+        if "bouts" in one
+    ]
+    print_table(rows, "action", "bouts", "F1", "of what was called so, is", "of what is, found")
 
 
 # `--help` of a group of commands: plain text, in sections, in the order of use.

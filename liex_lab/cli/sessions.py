@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import shlex
 import socket
 import subprocess
 import tempfile
+import webbrowser
 from contextlib import ExitStack
+from html import escape
 from math import isnan
 from pathlib import Path
-from typing import Annotated, Literal
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Annotated, Literal
 from urllib.parse import quote
 
 import typer
@@ -20,11 +24,15 @@ from liex_lab.cli.options import (
     Settings,
     TopicName,
     WhichPlan,
+    load_plan,
     region_setting,
     say,
 )
 from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.progress import progress_bar
+
+if TYPE_CHECKING:
+    from liex_lab.pipelines.study.status import SessionStatus
 
 
 def compare(
@@ -32,28 +40,31 @@ def compare(
         list[Path],
         typer.Argument(metavar="PLACE...", help="Study files, sessions, or folders of sessions."),
     ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="The folder for the tables.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Output folder.")],
     measures: Annotated[
         list[str] | None,
         typer.Option(
-            "--measure", help="A column of summary.csv; repeatable; by default the usual ones."
+            "--measure",
+            help="A column of summary.csv to compare; repeatable; default: the common measures.",
         ),
     ] = None,
     reference: Annotated[
-        str | None, typer.Option("--reference", help="Compare with this group only.")
+        str | None, typer.Option("--reference", help="Compare only with this group.")
     ] = None,
     animals: Annotated[
         Path | None,
-        typer.Option("--animals", metavar="CSV", help="subject_id with group, cage, sex or batch."),
+        typer.Option(
+            "--animals", metavar="CSV", help="Table of subject_id with group, cage, sex or batch."
+        ),
     ] = None,
-    engine: Annotated[str, typer.Option("--engine", help="auto, permutation or mixed.")] = "auto",
+    engine: Annotated[
+        str, typer.Option("--engine", help="Test: auto, permutation or mixed.")
+    ] = "auto",
     only_trusted: Annotated[
-        bool, typer.Option("--only-trusted", help="Leave out sessions marked 'look at it'.")
+        bool, typer.Option("--only-trusted", help="Exclude sessions that need review.")
     ] = False,
 ) -> None:
-    """Compare groups of animals: the test that the design allows, effect sizes, and n at every
-    level.
-    """
+    """Compare groups of animals: tests that the design allows, effect sizes, and sample sizes."""
     from liex_lab.api import compare_groups
     from liex_lab.behaviour.cohort import counted_units
     from liex_lab.dashboards.units import counted
@@ -98,7 +109,7 @@ def report(
         Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
     ],
 ) -> None:
-    """Write a session's report.html again, with all corrections."""
+    """Regenerate a session's report.html, with all corrections."""
     from liex_lab.dashboards.report.report import write_report
 
     say(f"report: {write_report(session)}")
@@ -108,27 +119,27 @@ def figures(
     place: Annotated[
         Path,
         typer.Argument(
-            metavar="PLACE", help="A session, a study, a folder with sessions, or a comparison."
+            metavar="PLACE", help="A session, a study, a folder of sessions, or a comparison."
         ),
     ],
     only: Annotated[
         list[str] | None,
-        typer.Option("--only", metavar="NAME", help="Only this figure; repeatable."),
+        typer.Option("--only", metavar="NAME", help="Draw only this figure; repeatable."),
     ] = None,
     formats: Annotated[
         list[str] | None,
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="svg, pdf or png, or pages: one PDF of all; repeatable.",
+            help="svg, pdf or png; pages: one PDF with all figures; repeatable.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="The folder for them; by default PLACE/figures."),
+        typer.Option("--out", metavar="DIR", help="Output folder; default: PLACE/figures."),
     ] = None,
 ) -> None:
-    """Draw figures for a paper: occupancy, trajectory, ethogram, transitions, groups and others."""
+    """Draw publication figures: occupancy, trajectory, ethogram, transitions, groups and more."""
     from liex_lab.api import draw_figures
     from liex_lab.dashboards.units import counted
 
@@ -156,34 +167,32 @@ def export(
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="DIR", help="The folder for it; by default the session's own."
-        ),
+        typer.Option("--out", metavar="DIR", help="Output folder; default: the session folder."),
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what is there under this name.")
+        bool, typer.Option("--overwrite", help="Replace an existing file or folder.")
     ] = False,
     actions: Annotated[
         list[str] | None,
-        typer.Option("--action", metavar="WORD", help="Video: clips of this action; repeatable."),
+        typer.Option(
+            "--action", metavar="WORD", help="Video: show clips of this action; repeatable."
+        ),
     ] = None,
     groups: Annotated[
         list[str] | None,
-        typer.Option("--group", metavar="NAME", help="Video: only this group; repeatable."),
+        typer.Option("--group", metavar="NAME", help="Video: show only this group; repeatable."),
     ] = None,
     start_s: Annotated[
-        float | None, typer.Option("--from", metavar="S", min=0.0, help="Video: from this time on.")
+        float | None, typer.Option("--from", metavar="S", min=0.0, help="Video: start time, s.")
     ] = None,
     stop_s: Annotated[
-        float | None, typer.Option("--until", metavar="S", min=0.0, help="Video: until this time.")
+        float | None, typer.Option("--until", metavar="S", min=0.0, help="Video: end time, s.")
     ] = None,
     slower: Annotated[
-        float, typer.Option("--slower", metavar="N", help="Video: this many times slower.")
+        float, typer.Option("--slower", metavar="N", help="Video: slow-motion factor.")
     ] = 1.0,
 ) -> None:
-    """Write sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, CSV or Excel files, or as a video,
-    several side by side.
-    """
+    """Export sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, CSV or Excel, or as a video."""
     from liex_lab.exchange import export as job
     from liex_lab.sessions import Session
 
@@ -223,20 +232,23 @@ def show(
     web: Annotated[
         bool,
         typer.Option(
-            "--web", help="Open it in the browser; Rerun's viewer there calls tel.rerun.io."
+            "--web",
+            help="Open it in the browser, where Rerun's viewer sends usage data to tel.rerun.io.",
         ),
     ] = False,
     at_s: Annotated[
-        float | None, typer.Option("--at", metavar="S", min=0.0, help="Open it at this time.")
+        float | None, typer.Option("--at", metavar="S", min=0.0, help="Time to start at, s.")
     ] = None,
     depth: Annotated[
         Literal["kept", "all"],
-        typer.Option("--depth", help="all: whole depth pictures, read from the recording."),
+        typer.Option("--depth", help="all: full depth images, read from the recording."),
     ] = "kept",
     recording: Annotated[
         str | None,
         typer.Option(
-            "--recording", metavar="FILE", help="The recording, for --depth all if it has moved."
+            "--recording",
+            metavar="FILE",
+            help="Path of the recording for --depth all, if it has moved.",
         ),
     ] = None,
 ) -> None:
@@ -247,7 +259,7 @@ def show(
     if web and at_s is not None:
         raise typer.BadParameter("a moment can be shown in a window only; leave out --web or --at")
     if recording is not None and depth != "all":
-        raise typer.BadParameter("a recording is read for whole pictures only; add --depth all")
+        raise typer.BadParameter("a recording is read for full depth images only; add --depth all")
     replay = Session.open(session).path / "session.rrd"
     if at_s is None and not web and not has_screen():
         raise LiexError(
@@ -261,11 +273,11 @@ def show(
 
 def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Path]:
     """A replay of a session's full depth images; empty, with a note, if there is no recording."""
-    from liex_lab.pipelines.show import whole_pictures
+    from liex_lab.pipelines.show import whole_images
 
     try:
         with progress_bar() as progress:
-            return [whole_pictures(session, scratch / "depth.rrd", recording, progress)]
+            return [whole_images(session, scratch / "depth.rrd", recording, progress)]
     except LiexError as error:
         say(f"note: {error}")
         say("note: the replay shows what the session keeps of the depth")
@@ -317,23 +329,23 @@ def convert(
         typer.Option("--to", metavar="TARGET", help="NAME.mcap, or a folder for PNG images."),
     ],
     fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second, where the file has no times.")
+        float | None, typer.Option("--fps", help="Frame rate of a recording without timestamps.")
     ] = None,
     topic: TopicName = None,
     step_mm: Annotated[
         float | None,
         typer.Option(
-            "--step-mm", min=0.001, help="Round depth to steps of this size; not for MCAP."
+            "--step-mm", min=0.001, help="Round depths to steps of this size; not for MCAP."
         ),
     ] = None,
     ros: Annotated[
-        bool, typer.Option("--ros", help="Write ROS 2 messages instead of Foxglove's (MCAP).")
+        bool, typer.Option("--ros", help="MCAP: write ROS 2 messages instead of Foxglove's.")
     ] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what is there under this name.")
+        bool, typer.Option("--overwrite", help="Replace an existing file or folder.")
     ] = False,
 ) -> None:
-    """Write a recording as MCAP (which keeps every depth) or as a folder of 16-bit PNG images."""
+    """Convert a recording to MCAP (lossless) or to a folder of 16-bit PNG images."""
     from liex_lab.pipelines.convert import convert as job
 
     with progress_bar() as progress:
@@ -359,37 +371,43 @@ def pack(
         typer.Option(
             "--to",
             metavar="NAME.mcap",
-            help="The archive; by default NAME.pack.mcap beside the recording.",
+            help="The archive; default: NAME.pack.mcap next to the recording.",
         ),
     ] = None,
     plan: WhichPlan = None,
     region: Annotated[
         str | None,
-        typer.Option("--region", metavar='"X,Y X,Y ..."', help="Keep what is in this polygon."),
+        typer.Option(
+            "--region", metavar='"X,Y X,Y ..."', help="Keep only the inside of this polygon."
+        ),
     ] = None,
-    whole: Annotated[bool, typer.Option("--whole", help="Keep whole pictures.")] = False,
+    whole: Annotated[bool, typer.Option("--whole", help="Keep the whole images.")] = False,
     verify: Annotated[
         bool,
-        typer.Option("--verify", help="Read it again and compare; an archive with its own hash."),
+        typer.Option(
+            "--verify",
+            help="Compare the archive with the recording; of an existing archive, check its hash.",
+        ),
     ] = False,
     delete_original: Annotated[
         bool,
-        typer.Option("--delete-original", help="Remove the recording after it was verified."),
+        typer.Option(
+            "--delete-original", help="Delete the recording once the archive is verified."
+        ),
     ] = False,
     topic: TopicName = None,
     settings: Settings = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace what is there under this name.")
+        bool, typer.Option("--overwrite", help="Replace an existing file or folder.")
     ] = False,
 ) -> None:
-    """Pack a recording without loss: its arena in 16 bits, half as large, read by every verb."""
+    """Pack a recording into a lossless archive of half its size, which all commands read."""
     from liex_lab.pipelines.convert import pack as job
-    from liex_lab.plan import Plan
 
     if whole and region is not None:
         raise typer.BadParameter("--whole keeps every pixel; leave out --region or --whole")
     asked = [*region_setting(region), *([] if topic is None else [f"recording.topic={topic}"])]
-    chosen = Plan.load(plan or "mouse").with_settings([*asked, *(settings or [])])
+    chosen = load_plan(plan, [*asked, *(settings or [])])
     with progress_bar() as progress:
         done = job(
             recording,
@@ -409,10 +427,183 @@ def pack(
         share = 100 * done.n_bytes / done.source_bytes
         size += f", {share:.0f}% of the recording's {done.source_bytes / 1e6:.1f} MB"
     say(f"archive: {done.path} ({done.n_frames} frames, {size})")
-    say(f"kept:    {100 * done.kept:.0f}% of a picture's pixels, bit for bit")
+    say(f"kept:    {100 * done.kept:.0f}% of an image's pixels, bit for bit")
     if done.verified:
-        say("checked: every picture and time is that of the recording")
+        say("checked: every image and time equals the recording's")
     for path in done.deleted:
         say(f"removed: {path}")
     for sentence in done.notes:
         say(f"note: {sentence}")
+
+
+# The commands of `liex` for studies.
+
+
+SOME_FAILED = 3  # the exit code of a study in which a session failed
+
+StudyOrInit = Annotated[
+    str, typer.Argument(metavar="STUDY|init", help="A study's .toml file; init creates one.")
+]
+InitFolder = Annotated[
+    Path | None, typer.Argument(metavar="[FOLDER]", help="With init: the folder of the recordings.")
+]
+OnlyIds = Annotated[
+    list[str] | None,
+    typer.Option("--only", metavar="ID", help="Measure only this session; repeatable."),
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")
+]
+SlurmFile = Annotated[
+    str | None,
+    typer.Option("--slurm", metavar="FILE", help="Settings of Slurm jobs, .toml."),
+]
+
+
+def cohort(
+    study: StudyOrInit,
+    folder: InitFolder = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the status of each session without measuring.")
+    ] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Measure failed sessions again.")] = False,
+    again: Annotated[
+        bool,
+        typer.Option("--again", help="Measure all sessions again, including those that are done."),
+    ] = False,
+    only: OnlyIds = None,
+    workers: Annotated[
+        int, typer.Option("--workers", min=0, help="Number of processes; 0: one per two cores.")
+    ] = 0,
+    scheduler: Scheduler = None,
+    slurm: SlurmFile = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="With init: replace an existing study file.")
+    ] = False,
+) -> None:
+    """Measure the pending sessions of a study; exits with code 3 if a session failed."""
+    if study == "init":
+        from liex_lab.pipelines.study.init import begin_study
+
+        with progress_bar() as progress:
+            file = begin_study(folder or Path(), overwrite, say=say, progress=progress)
+        say(f"study: {file}")
+        return
+    if folder is not None:
+        raise typer.BadParameter(
+            "a folder is named only after init, as in `liex cohort init FOLDER`"
+        )
+    from liex_lab.api import run_study
+
+    if scheduler is not None:
+        from liex_lab.pipelines.study.cluster import is_encrypted
+
+        if not is_encrypted(scheduler):
+            say(f"what goes to and from {scheduler} is not encrypted, and each side runs what the")
+            say("other sends: a scheduler for a network that you trust, or tls://")
+    standings = run_study(
+        study,
+        workers=workers,
+        scheduler=scheduler,
+        slurm=slurm,
+        retry=retry,
+        again=again,
+        only=only or (),
+        dry_run=dry_run,
+    )
+    if _tell_study(standings, dry_run):
+        say(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
+        raise typer.Exit(SOME_FAILED)
+
+
+def dashboard(
+    study: Annotated[
+        Path,
+        typer.Argument(metavar="STUDY", help="A study's .toml file, or a folder of sessions."),
+    ],
+    host: Annotated[
+        str,
+        typer.Option("--host", help="Address to listen on; traffic is not encrypted."),
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Port to listen on; 0: any free port.")
+    ] = 8050,
+    open_browser: Annotated[
+        bool, typer.Option("--open", help="Open the page in the browser.")
+    ] = False,
+) -> None:
+    """Open a study in the browser; Ctrl+C stops the server."""
+    from liex_lab.api import serve_dashboard
+
+    with progress_bar() as progress, ExitStack() as stack:
+
+        def told(address: str) -> None:
+            """Print the dashboard's `address`, and open it if requested."""
+            say(f"dashboard: {address}   (Ctrl+C ends it)")
+            if open_browser:  # by a file: other accounts can read a program's arguments
+                folder = stack.enter_context(TemporaryDirectory(prefix="liex-"))
+                webbrowser.open(page_that_opens(address, Path(folder)).as_uri())
+
+        serve_dashboard(study, host=host, port=port, told=told, progress=progress)
+
+
+def page_that_opens(address: str, folder: Path) -> Path:
+    """Write a page that redirects to an address; returns its path.
+
+    Args:
+        address: the target, which includes a secret.
+        folder: a folder that only this account can read.
+    """
+    page = folder / "dashboard.html"
+    page.write_text(f'<meta http-equiv="refresh" content="0;url={escape(address)}">')
+    return page
+
+
+def verify(
+    session: Annotated[
+        Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
+    ],
+    recording: Annotated[
+        Path | None,
+        typer.Option("--recording", help="Measure this recording again and compare the tables."),
+    ] = None,
+) -> None:
+    """Check a session's files and, with --recording, whether re-running reproduces its tables."""
+    from liex_lab.api import verify_session
+
+    with progress_bar() as progress:
+        findings = verify_session(session, recording, progress=progress)
+    for finding in findings:
+        say(f"{finding.state:6}{finding.sentence}")
+    if any(finding.state == "wrong" for finding in findings):
+        raise typer.Exit(1)
+
+
+def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
+    """Print sessions that are not done, and the number in each state.
+
+    Returns the number of sessions that failed or whose recording is missing.
+    """
+    from liex_lab.pipelines.study.status import to_check
+
+    counts: dict[str, int] = {}
+    for one in standings:
+        counts[one.in_words] = counts.get(one.in_words, 0) + 1
+        if one.missing:
+            gone = (
+                f"there is no recording {one.session.recording}; correct its path, or copy it there"
+            )
+            say(f"{'missing':9}{one.session.id}  {gone}")
+        elif one.state == "done" and one.reason:
+            say(f"{'done':9}{one.session.id}  {one.reason}")
+        elif all_of_them or one.state not in ("done", "excluded"):
+            remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
+            say(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
+    remarks = [one.session.remark for one in standings if one.state not in ("failed", "excluded")]
+    for remark in dict.fromkeys(filter(None, [*remarks, *to_check(standings)])):
+        say(remark)
+    say(
+        f"{len(standings)} session{'' if len(standings) == 1 else 's'}: "
+        + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
+    )
+    return counts.get("failed", 0) + counts.get("recording missing", 0)

@@ -7,7 +7,6 @@ columns iterates with `blocks`, which releases the pages of all arrays on disk a
 from __future__ import annotations
 
 import errno
-import gc
 import math
 import mmap
 import os
@@ -18,7 +17,6 @@ import threading
 import weakref
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -70,22 +68,6 @@ def rest() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)
-
-
-@contextmanager
-def uncollected() -> Iterator[None]:
-    """Switch Python's garbage collector off within the block, if it was on.
-
-    For code that creates many small objects, such as imports and figures, which the collector would
-    scan repeatedly.
-    """
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
 
 
 def on_disk(folder: Path) -> Allocator:
@@ -270,7 +252,7 @@ def why_short(error: BaseException | None) -> str:
             return _NO_FILES
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
             return _NO_MEMORY
-        if not isinstance(error, LiexError) and any(said in str(error).lower() for said in _MEMORY):
+        if not isinstance(error, LiexError) and any(sign in str(error).lower() for sign in _MEMORY):
             return _NO_MEMORY
         error = error.__cause__ or error.__context__
     return ""

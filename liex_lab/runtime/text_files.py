@@ -266,8 +266,8 @@ def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
     table = pd.read_csv(path)
     names = [name for name in texts if name in table]
     if names:
-        said = pd.read_csv(path, usecols=names, dtype="str", keep_default_na=False)
-        table = table.assign(**{name: said[name] for name in names})
+        cells = pd.read_csv(path, usecols=names, dtype="str", keep_default_na=False)
+        table = table.assign(**{name: cells[name] for name in names})
     return table.rename(columns=as_it_was).map(as_it_was)
 
 

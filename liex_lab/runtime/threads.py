@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import gc
 import sys
+import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from importlib import import_module
 from typing import TYPE_CHECKING, TypeVar
-
-from liex_lab.runtime.memory import uncollected
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -86,31 +84,24 @@ def imported_ahead(*modules: str) -> Iterator[None]:
     """Import modules one after another on a separate thread while the block runs.
 
     An import of the same module elsewhere waits for it. Missing modules are skipped here; their
-    importers report them. Afterwards the objects in memory are excluded from garbage collection
-    until the block ends: scanning the modules repeatedly takes a sixth of a short run.
+    importers report them.
 
     Args:
         modules: dotted names, in the order in which they will be needed.
     """
+    ended = threading.Event()
 
     def fetch() -> None:
-        with uncollected():
-            for name in modules:
-                if left:
-                    return
+        for name in modules:
+            if not ended.is_set():
                 with suppress(ImportError):
                     import_module(name)
-            gc.freeze()
-            if left:  # the block has ended, and nothing else would undo this
-                gc.unfreeze()
 
-    left: list[bool] = []
     with in_background(fetch):
         try:
             yield
         finally:
-            left.append(True)
-            gc.unfreeze()
+            ended.set()
 
 
 @contextmanager

@@ -33,6 +33,7 @@ from liex_lab.plan.study import Study
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.memory import peak_memory_mb, rest
+from liex_lab.runtime.processes import Done, Processes, Work
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Provenance, Session, SessionWriter, cutouts, evidence, mcap, rrd
 from liex_lab.sessions.writer import ReportMaker
@@ -41,13 +42,10 @@ from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Subject
 
-from ..build import build_recording, build_tracker, kept_estimator
-from ..origin import build_provenance
-from ..session import conclude
-from ..shards import CHUNK, Shard, measure_shards
+from ..build import build_provenance, build_recording, build_tracker, kept_estimator
+from ..session import CHUNK, Shard, conclude, measure_shards
 from ..study.cluster import crew_of
 from ..study.status import standings
-from ..workers import Done, Processes, Work
 from . import speed
 from .speed import FPS, STEP_NS, as_mcap, evaluate_kinds, isolated, looped, to_and_fro
 

@@ -27,10 +27,9 @@ from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, film
 from liex_lab.simulation.scenes.recording import TrueAnimal
 
-from ..arenas import measure_arenas
-from ..build import plan_of
-from ..regions import propose_arenas
-from ..session import measure_session
+from ..arenas import run_arenas
+from ..build import plan_of, propose_arenas
+from ..session import run_session
 
 Array = NDArray[np.float64]
 
@@ -153,10 +152,10 @@ def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
             arenas = propose_arenas(recording, quick)
             if arenas:  # each is a session
                 quick = quick.model_copy(update={"arenas": arenas})
-                outcomes = measure_arenas(recording, quick, folder)
+                outcomes = run_arenas(recording, quick, folder, report=False)
                 refused = [one.error for one in outcomes if one.error is not None]
             else:
-                measure_session(recording, quick, folder)
+                run_session(recording, quick, folder, report=False)
                 refused = []
         except LiexError as error:
             return [], [str(error)], error.exit_code

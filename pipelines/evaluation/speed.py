@@ -61,7 +61,7 @@ from liex_lab.simulation.simulator import world_of
 
 from ..build import build_scene, plan_of
 from ..convert import convert
-from ..live import follow_live
+from ..live import track_live
 from ..training.pose_model import (
     BASELINES,
     cached_baseline,
@@ -355,7 +355,7 @@ def evaluate_live(
         progress: called with the progress of rendering and tracking, if there is one camera.
 
     Returns:
-        `rate_hz`, the numbers of `follow_live`, and the protocol; of several cameras the largest
+        `rate_hz`, the numbers of `track_live`, and the protocol; of several cameras the largest
         latencies, and in `cameras` the numbers of each.
     """
     film = partial(_film, animal, n_frames, learn_frames, rate_hz)
@@ -397,14 +397,14 @@ def _film(
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
         plan = plan_of(animal)
         warm = arriving[: learn_frames + _WARM]
-        follow_live(replayed(warm, _WARM_SPEED), plan, learn_frames=learn_frames)
+        track_live(replayed(warm, _WARM_SPEED), plan, learn_frames=learn_frames)
         if ready is not None:
             ready.wait()
     except BaseException:
         if ready is not None:
             ready.abort()  # the others would wait forever
         raise
-    numbers, _ = follow_live(replayed(arriving), plan, learn_frames=learn_frames, progress=progress)
+    numbers, _ = track_live(replayed(arriving), plan, learn_frames=learn_frames, progress=progress)
     return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers}
 
 

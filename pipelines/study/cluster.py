@@ -21,9 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from liex_lab.errors import MissingPackageError, StudyError, how_to_install
 from liex_lab.plan import plans_folder
 from liex_lab.runtime.durable import Scratch
+from liex_lab.runtime.processes import n_cores, worker_environment
 from liex_lab.runtime.text_files import read_toml
 
-from ..workers import n_cores, worker_environment
 from .crew import DEATHS, Crew
 
 if TYPE_CHECKING:

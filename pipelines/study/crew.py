@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import RecordingError, StudyError
 from liex_lab.plan.study import PlannedSession
+from liex_lab.runtime.processes import Done, Work, WorkerPool
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.folder import (
     describe_failure,
@@ -27,7 +28,6 @@ from liex_lab.sessions.folder import (
 )
 from liex_lab.sessions.verdict import read_verdict
 
-from ..workers import Done, Work, WorkerPool
 from .sharing import LOOKING, LookAtSession, Stage, about, input_stamp, read_document
 from .status import SessionStatus, to_look_at
 

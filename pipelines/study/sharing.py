@@ -37,10 +37,9 @@ from liex_lab.sessions.folder import describe_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
 from liex_lab.tracking.own_shape import MOST_APART, SessionBody, agree, spread_of
 
-from ..build import build_estimator, build_recording, open_planned, shape_labels
+from ..build import animal_facts, build_estimator, build_recording, open_planned, shape_labels
 from ..choice import fit_plan
-from ..origin import animal_facts
-from ..shards import MEASURING
+from ..session import MEASURING
 
 LOOK_FILE = "look.json"
 LOOKING = "looking at the animal"

@@ -12,7 +12,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from liex_lab.pipelines.shards import MEASURING
+from liex_lab.pipelines.session import MEASURING
 
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session

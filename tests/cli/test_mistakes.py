@@ -28,48 +28,17 @@ STORED = depth_frames(12)
 Maker = Callable[[Path], Path]
 
 
+def painted(folder: Path, *shape: int) -> Path:
+    """A folder of 8-bit images of this shape."""
+    write_png_folder(folder / "r", STORED)
+    for path in (folder / "r").glob("*.png"):
+        cv2.imwrite(str(path), np.full((48, 64, *shape), 90, np.uint8))
+    return folder / "r"
+
+
 def cut_dat(folder: Path) -> Path:
     cut(write_moseq_folder(folder / "r", STORED) / "depth.dat", 0.6)
     write_camera(folder / "r")
-    return folder / "r"
-
-
-def cut_archive(folder: Path) -> Path:
-    archive = write_archive(
-        cut_dat(folder), folder / "r.tar.gz", ["camera.toml", "metadata.json", "depth.dat"]
-    )
-    return cut(archive, 0.6)
-
-
-def cut_png(folder: Path) -> Path:
-    cut(write_png_folder(folder / "r", STORED) / "frame_7.png", 0.5)
-    return folder / "r"
-
-
-def cut_mcap(folder: Path) -> Path:
-    return cut(write_mcap(folder / "r.mcap", STORED), 0.6)
-
-
-def cut_at_once(folder: Path) -> Path:
-    return cut(write_mcap(folder / "r.mcap", STORED), 0.01)
-
-
-def empty_folder(folder: Path) -> Path:
-    (folder / "r").mkdir()
-    return folder / "r"
-
-
-def colour_folder(folder: Path) -> Path:
-    write_png_folder(folder / "r", STORED)
-    for path in (folder / "r").glob("*.png"):
-        cv2.imwrite(str(path), np.full((48, 64, 3), 90, np.uint8))
-    return folder / "r"
-
-
-def grey_folder(folder: Path) -> Path:
-    write_png_folder(folder / "r", STORED)
-    for path in (folder / "r").glob("*.png"):
-        cv2.imwrite(str(path), np.full((48, 64), 90, np.uint8))
     return folder / "r"
 
 
@@ -78,13 +47,38 @@ def photograph(folder: Path) -> Path:
     return folder / "mouse.jpg"
 
 
-def no_camera(folder: Path) -> Path:
-    (write_png_folder(folder / "r", STORED) / "camera.toml").unlink()
+def packed(folder: Path) -> Path:
+    names = ["camera.toml", "metadata.json", "depth.dat"]
+    return write_archive(cut_dat(folder), folder / "r.tar.gz", names)
+
+
+def without(folder: Path, name: str) -> Path:
+    (write_png_folder(folder / "r", STORED) / name).unlink()
     return folder / "r"
 
 
-def missing(folder: Path) -> Path:
-    return folder / "nothing.mcap"
+RECORDINGS: dict[str, tuple[Maker, str]] = {
+    "cut .dat": (cut_dat, "7 whole frames can be read from it"),
+    "cut archive": (lambda folder: cut(packed(folder), 0.6), "cut short or damaged"),
+    "cut image": (
+        lambda folder: cut(write_png_folder(folder / "r", STORED) / "frame_7.png", 0.5).parent,
+        "11 whole frames can be read from it",
+    ),
+    "cut .mcap": (
+        lambda folder: cut(write_mcap(folder / "r.mcap", STORED), 0.6),
+        "accept_truncated=true",
+    ),
+    "hardly any of an .mcap": (
+        lambda folder: cut(write_mcap(folder / "r.mcap", STORED), 0.01),
+        "the file is cut or damaged",
+    ),
+    "empty folder": (lambda folder: folder, "is an empty folder; give a folder of 16-bit PNG"),
+    "colour": (lambda folder: painted(folder, 3), "16-bit"),
+    "grey": (painted, "16-bit"),
+    "photograph": (photograph, "16-bit depth was expected"),
+    "no camera": (lambda folder: without(folder, "camera.toml"), "camera.toml"),
+    "nothing": (lambda folder: folder / "nothing.mcap", "there is no file or folder"),
+}
 
 
 def whole(folder: Path) -> Path:
@@ -108,30 +102,16 @@ def refused(
     return told.err
 
 
-@pytest.mark.parametrize(
-    ("make", "says"),
-    [
-        (cut_dat, "7 whole frames can be read from it"),
-        (cut_archive, "cut short or damaged"),
-        (cut_png, "11 whole frames can be read from it"),
-        (cut_mcap, "accept_truncated=true"),
-        (cut_at_once, "the file is cut or damaged"),
-        (empty_folder, "is an empty folder; give a folder of 16-bit PNG"),
-        (colour_folder, "16-bit"),
-        (grey_folder, "16-bit"),
-        (photograph, "16-bit depth was expected"),
-        (no_camera, "camera.toml"),
-        (missing, "there is no file or folder"),
-    ],
-)
+@pytest.mark.parametrize("name", RECORDINGS)
 def test_a_recording_that_cannot_be_used(
+    name: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
-    make: Maker,
-    says: str,
 ) -> None:
-    recording, out = make(tmp_path), tmp_path / "results"
+    make, says = RECORDINGS[name]
+    (tmp_path / "in").mkdir()
+    recording, out = make(tmp_path / "in"), tmp_path / "results"
     sentence = refused(capsys, monkeypatch, "run", str(recording), "--out", str(out))
     assert says in sentence
     assert str(tmp_path) in sentence
@@ -139,51 +119,33 @@ def test_a_recording_that_cannot_be_used(
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "content", "says"),
     [
-        (["--plan", "moose"], "did you mean 'mouse'"),
-        (["--plan", "no/such/plan.toml"], "bundled are: "),
-        (["--set", "animal.spine=65"], "nearest one is animal.spine_m"),
-        (["--set", "animal.spine_mm=long"], "animal.spine_mm should be"),
-        (["--set", "spine_mm"], "--set takes key=value"),
-        (["--set", "estimation.model=rat"], "there is no model 'rat'"),
+        (["--plan", "moose"], "", "did you mean 'mouse'"),
+        (["--plan", "no/such/plan.toml"], "", "bundled are: "),
+        (["--set", "animal.spine=65"], "", "nearest one is animal.spine_m"),
+        (["--set", "animal.spine_mm=long"], "", "animal.spine_mm should be"),
+        (["--set", "spine_mm"], "", "--set takes key=value"),
+        (["--set", "estimation.model=rat"], "", "there is no model 'rat'"),
+        ([], "[animal]\nspine = 65.0\n", "nearest one is animal.spine_m"),
+        ([], "[animl]\nspine_mm = 65.0\n", "[animal]"),
+        ([], "[animal\n", "should be a TOML file"),
+        ([], "[animal]\nspine_mm = 'long'\n", "animal.spine_mm should be"),
     ],
 )
 def test_a_plan_that_cannot_be_used(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
     words: list[str],
-    says: str,
-) -> None:
-    out = tmp_path / "results"
-    assert says in refused(
-        capsys, monkeypatch, "run", str(whole(tmp_path)), "--out", str(out), *words
-    )
-    assert not out.exists()
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        ("[animal]\nspine = 65.0\n", "nearest one is animal.spine_m"),
-        ("[animl]\nspine_mm = 65.0\n", "[animal]"),
-        ("[animal\n", "should be a TOML file"),
-        ("[animal]\nspine_mm = 'long'\n", "animal.spine_mm should be"),
-    ],
-)
-def test_a_plan_of_ones_own_with_a_slip(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
     content: str,
     says: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    own, out = tmp_path / "own.toml", tmp_path / "results"
+    out, own = tmp_path / "results", tmp_path / "own.toml"
     own.write_text(content)
-    assert says in refused(
-        capsys, monkeypatch, "run", str(whole(tmp_path)), "--plan", str(own), "--out", str(out)
-    )
+    words = words or ["--plan", str(own)]
+    run = ("run", str(whole(tmp_path)), "--out", str(out), *words)
+    assert says in refused(capsys, monkeypatch, *run)
     assert not out.exists()
 
 
@@ -206,7 +168,7 @@ def test_a_place_that_is_a_file_is_told_before_any_work(
 
 
 def test_a_mistake_in_a_process_of_its_own(tmp_path: Path) -> None:
-    ran = liex("run", str(cut_mcap(tmp_path)), "--out", str(tmp_path / "results"))
+    ran = liex("run", str(RECORDINGS["cut .mcap"][0](tmp_path)), "--out", str(tmp_path / "results"))
     assert (ran.returncode, ran.stdout) == (1, "")
     assert "whole frames can be read from it; copy it again" in ran.stderr
     assert len(ran.stderr.strip().splitlines()) == 1

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Page, Route, expect
 
-from liex_lab.cli.study import page_that_opens
+from liex_lab.cli.sessions import page_that_opens
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
 from tests.dashboards import copies

@@ -115,6 +115,6 @@ def shared_task(n: int) -> list[tuple[int, int]]:
 
 
 def stretch(number: int) -> tuple[int, int]:
-    """Stands in for `shards.measure_shard`."""
+    """Stands in for `measure_shard`."""
     time.sleep(0.2)
     return number, os.getpid()

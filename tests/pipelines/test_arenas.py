@@ -5,29 +5,37 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.arenas import measure_arenas
-from liex_lab.pipelines.regions import propose_arenas
-from liex_lab.pipelines.session import measure_session
+from liex_lab.pipelines import session as job
+from liex_lab.pipelines.arenas import run_arenas
+from liex_lab.pipelines.build import propose_arenas, stated_corners
+from liex_lab.pipelines.choice import fit_plan
+from liex_lab.pipelines.doctor import examine
+from liex_lab.pipelines.evaluation.scenes import read_individuals
 
-from liex_lab.errors import EstimationError, PlanError, SessionError
+from liex_lab.errors import EstimationError, MisfitError, PlanError, SessionError
+from liex_lab.evaluation.scores import error_of
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import Region, SeveralArenas
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
+from liex_lab.sessions import Session, SessionWriter
 from liex_lab.simulation.scenes.catalogue import film
 from liex_lab.simulation.scenes.recording import TrueScene
+from tests.pipelines.conftest import measure
+from tests.pipelines.test_shards import InTurn
 
 N_FRAMES = 40
+measure_all = partial(run_arenas, report=False)
 DIGEST = "0123456789abcdef" * 4
 
 
 @cache
-def pictures(scene: str = "two-arenas") -> tuple[TrueScene, np.ndarray]:
+def images(scene: str = "two-arenas") -> tuple[TrueScene, np.ndarray]:
     """A rendered scene, and its pictures."""
     made = film(scene, 1001, N_FRAMES)
     return made, made.depths(0, N_FRAMES)
@@ -35,7 +43,7 @@ def pictures(scene: str = "two-arenas") -> tuple[TrueScene, np.ndarray]:
 
 def recording(scene: str = "two-arenas", read: list[int] | None = None) -> Recording:
     """The scene as a recording that notes in `read` which frames are decoded."""
-    made, depths = pictures(scene)
+    made, depths = images(scene)
 
     def decode(index: int) -> Depth:
         if read is not None:
@@ -51,7 +59,7 @@ def recording(scene: str = "two-arenas", read: list[int] | None = None) -> Recor
 
 def several(*more: str) -> Plan:
     """The plan of the mouse with the two arenas of the scene."""
-    made, _ = pictures()
+    made, _ = images()
     arenas = propose_arenas(made, Plan.load("mouse"))
     assert len(arenas) == 2
     facts = ({"name": "left", "subject_id": "m01"}, {"name": "right", "subject_id": "m02"})
@@ -84,46 +92,43 @@ def tables(session: Path) -> dict[str, str]:
 @pytest.fixture(scope="module")
 def sessions(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sequence[Path], list[int]]:
     read: list[int] = []
-    outcomes = measure_arenas(recording(read=read), several(), tmp_path_factory.mktemp("arenas"))
+    outcomes = measure_all(recording(read=read), several(), tmp_path_factory.mktemp("arenas"))
     assert [(one.name, one.error) for one in outcomes] == [("left", None), ("right", None)]
     return [one.session for one in outcomes if one.session is not None], read
 
 
+def alone(session: Path, scene: str, out: Path, masked: bool) -> Path:
+    """The session of one arena's region alone, stated in the plan or cut out beforehand."""
+    plan = Plan.load(session / "plan.toml")
+    assert plan.arenas is None
+    assert session.name == f"{plan.session.name}.liex"
+    whole = recording(scene)
+    cut = whole.masked(corners(plan.arena.region)) if masked else whole
+    return measure(cut, plan, out / str(masked))
+
+
 @pytest.mark.slow
 def test_every_arena_is_the_session_of_the_same_arena_cut_out_and_run_alone(sessions, tmp_path):
-    for session in sessions[0]:
-        plan = Plan.load(session / "plan.toml")
-        assert plan.arenas is None
-        assert session.name == f"{plan.session.name}.liex"
-        alone = measure_session(recording(), plan, tmp_path / "alone")
-        assert tables(alone) == tables(session)
-        whole = recording()
-        masked = whole.masked(corners(plan.arena.region))
-        again = measure_session(masked, plan, tmp_path / "masked")
-        assert tables(again) == tables(session)
+    for session, masked in zip(sessions[0], (False, True), strict=True):
+        assert tables(alone(session, "two-arenas", tmp_path, masked)) == tables(session)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_one_of_four_arenas_is_the_session_of_that_arena_run_alone(tmp_path):
     """Their regions lie side by side, and the animals in them differ in size and build."""
-    made, _ = pictures("four-arenas")
+    made, _ = images("four-arenas")
     plan = Plan.load("mouse").with_settings(["replay.depth=false"])
     arenas = propose_arenas(made, plan)
     assert len(arenas) == 4
-    outcomes = measure_arenas(
+    outcomes = measure_all(
         recording("four-arenas"), plan.model_copy(update={"arenas": arenas}), tmp_path / "four"
     )
     assert [one.error for one in outcomes] == [None] * 4
-    found = {one.name: tables(one.session) for one in outcomes if one.session is not None}
-    assert len({facts["poses.parquet"] for facts in found.values()}) == 4
-    for one in outcomes:
-        assert one.session is not None
-        own = Plan.load(one.session / "plan.toml")
-        alone = recording("four-arenas")
-        if one is outcomes[-1]:  # masked beforehand: the others cannot be in it
-            alone = alone.masked(corners(own.arena.region))
-        again = tables(measure_session(alone, own, tmp_path / "alone"))
-        assert again == found[one.name]
+    found = [one.session for one in outcomes if one.session is not None]
+    assert len({tables(path)["poses.parquet"] for path in found}) == 4
+    for path in found:
+        masked = path is found[-1]  # the others cannot be in it
+        assert tables(alone(path, "four-arenas", tmp_path, masked)) == tables(path)
 
 
 @pytest.mark.slow
@@ -133,12 +138,7 @@ def test_each_frame_is_decoded_once_for_all_arenas(sessions):
 
 @pytest.mark.slow
 def test_each_arena_follows_its_own_animal(sessions):
-    from liex_lab.pipelines.evaluation.scenes import read_individuals
-
-    from liex_lab.evaluation.scores import error_of
-    from liex_lab.sessions import Session
-
-    made, _ = pictures()
+    made, _ = images()
     measured = [read_individuals(Session.open(path))[0].joints_camera for path in sessions[0]]
     errors = [
         [float(np.nanmedian(error_of(own, animal.joints_camera))) for animal in made.animals]
@@ -151,7 +151,7 @@ def test_each_arena_follows_its_own_animal(sessions):
 
 @pytest.mark.slow
 def test_an_arena_without_an_animal_stops_no_other(tmp_path):
-    made, depths = pictures()
+    made, depths = images()
     plan = several()
     right = recording().masked(corners(listed(plan)[1].region))
     still = np.where(right.frame(0).depth > 0, np.median(depths, axis=0), 0).astype(np.float32)
@@ -160,7 +160,7 @@ def test_an_arena_without_an_animal_stops_no_other(tmp_path):
         return np.where(still > 0, still, depth)
 
     seen = recording().seen_by(made.camera, emptied, {})
-    left, empty = measure_arenas(seen, plan, tmp_path)
+    left, empty = measure_all(seen, plan, tmp_path)
     assert left.session is not None
     assert empty.session is None
     assert isinstance(empty.error, EstimationError)
@@ -168,8 +168,6 @@ def test_an_arena_without_an_animal_stops_no_other(tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupted_run_of_several_arenas_goes_on(sessions, tmp_path, monkeypatch):
-    from liex_lab.sessions import SessionWriter
-
     monkeypatch.setattr("liex_lab.sessions.checkpoint.EVERY_S", 0.0, raising=False)
     add = SessionWriter.add
 
@@ -181,46 +179,44 @@ def test_an_interrupted_run_of_several_arenas_goes_on(sessions, tmp_path, monkey
     with monkeypatch.context() as tired:
         tired.setattr(SessionWriter, "add", tire)
         with pytest.raises(KeyboardInterrupt):
-            measure_arenas(recording(), several(), tmp_path)
+            measure_all(recording(), several(), tmp_path)
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".part", ".part"]
-    outcomes = measure_arenas(recording(), several(), tmp_path)
+    outcomes = measure_all(recording(), several(), tmp_path)
     for one, before in zip(outcomes, sessions[0], strict=True):
         assert one.session is not None
         assert tables(one.session) == tables(before)
     with pytest.raises(SessionError, match="exists already"):
-        measure_arenas(recording(), several(), tmp_path)
+        measure_all(recording(), several(), tmp_path)
 
 
 def test_arenas_that_overlap_are_refused(tmp_path):
     plan = several()
     twice = [one.model_copy(update={"region": listed(plan)[0].region}) for one in listed(plan)]
     with pytest.raises(PlanError, match="the arenas left and right overlap in"):
-        measure_arenas(recording(), plan.model_copy(update={"arenas": twice}), tmp_path)
+        measure_all(recording(), plan.model_copy(update={"arenas": twice}), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
 def test_an_arena_outside_of_the_picture_is_refused(tmp_path):
     table = {"arenas": [{"name": "far", "region": {"rectangle": [[9000, 9000], [9100, 9100]]}}]}
     with pytest.raises(PlanError, match=r"the arena far: .*outside the image"):
-        measure_arenas(recording(), Plan.from_table(table), tmp_path)
+        measure_all(recording(), Plan.from_table(table), tmp_path)
 
 
 def test_a_plan_of_several_arenas_is_not_run_as_one(tmp_path):
     with pytest.raises(PlanError, match="lists several arenas"):
-        measure_session(recording(), several(), tmp_path)
+        measure(recording(), several(), tmp_path)
 
 
 def test_one_arena_is_not_proposed_as_several():
     plain = film("plain", 1001, N_FRAMES)
     assert propose_arenas(plain, Plan.load("mouse")) == []
-    with pytest.raises(PlanError, match="fewer than two are seen"):
-        measure_arenas(plain, Plan.load("mouse").with_settings(["arenas=auto"]), "nowhere")
+    with pytest.raises(PlanError, match="fewer than two are found"):
+        measure_all(plain, Plan.load("mouse").with_settings(["arenas=auto"]), "nowhere")
 
 
 def test_a_region_in_millimetres_on_the_floor_is_the_one_in_the_picture(tmp_path):
-    from liex_lab.pipelines.regions import stated_corners
-
-    made, _ = pictures()
+    made, _ = images()
     state = f"arena.floor={{point = [0, 0, {made.floor.distance_mm / made.floor.normal[2]}], "
     state += f"normal = {made.floor.normal.tolist()}}}"
     region = "arena.region={circle = {centre = [-150, 10], radius = 120}, unit = 'mm'}"
@@ -235,8 +231,6 @@ def test_a_region_in_millimetres_on_the_floor_is_the_one_in_the_picture(tmp_path
 
 @pytest.mark.slow
 def test_the_doctor_proposes_several_arenas_and_says_what_to_run_next():
-    from liex_lab.pipelines.doctor import examine
-
     found = examine(
         "synthetic:scene?name=two-arenas&seed=1001&frames=40", propose=True, named=False
     )
@@ -249,8 +243,6 @@ def test_the_doctor_proposes_several_arenas_and_says_what_to_run_next():
 
 @pytest.mark.slow
 def test_the_doctor_says_what_is_wrong_with_a_region_and_looks_all_the_same():
-    from liex_lab.pipelines.doctor import examine
-
     plan = Plan.load("mouse").with_settings(
         ["arena.region=[[9000, 9000], [9100, 9000], [9000, 9100]]"]
     )
@@ -261,40 +253,23 @@ def test_the_doctor_says_what_is_wrong_with_a_region_and_looks_all_the_same():
 
 @pytest.mark.slow
 def test_an_empty_arena_is_said_to_hold_no_animal():
-    from liex_lab.pipelines.choice import fit_plan
-
-    from liex_lab.errors import MisfitError
-
     with pytest.raises(MisfitError, match="no animal was found") as caught:
         fit_plan(film("empty", 1001, N_FRAMES), Plan.load("mouse"))
     assert caught.value.exit_code == 4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_workers_make_the_same_tables_of_every_arena(tmp_path, monkeypatch):
-    from liex_lab.pipelines import session, shards
-
-    class Inline:
-        """A pool whose only worker is this process."""
-
-        n_done, fewest, here = 0, 0, True
-
-        def each(self, do, works):
-            for work in works:
-                self.n_done += 1
-                yield do(work)
-
-    for module in (session, shards):
-        monkeypatch.setattr(module, "LENGTH", 15)
+    monkeypatch.setattr(job, "LENGTH", 15)
     address = f"synthetic:scene?name=two-arenas&seed=1001&frames={N_FRAMES}"
     region = "{circle = {centre = [-150, 10], radius = 170}, unit = 'mm'}"
     table = several().model_dump(exclude_none=True)
     table["arenas"] = [{"name": "left", "region": Plan().with_settings([f"arena.region={region}"])}]
     table["arenas"][0]["region"] = table["arenas"][0]["region"].arena.region.model_dump()
     plan = Plan.from_table(table)
-    pool = Inline()
-    (one,) = measure_arenas(address, plan, tmp_path / "workers", pool=pool)
-    (other,) = measure_arenas(address, plan, tmp_path / "alone")
+    pool = InTurn()
+    (one,) = measure_all(address, plan, tmp_path / "workers", pool=pool)
+    (other,) = measure_all(address, plan, tmp_path / "alone")
     assert pool.n_done == 3
     assert (one.error, other.error) == (None, None)
     assert tables(one.session) == tables(other.session)

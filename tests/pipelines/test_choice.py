@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from liex_lab.pipelines import choice
+from liex_lab.pipelines.build import animal_of
 from liex_lab.pipelines.choice import PlanFit, best, fit_plan, misfits_of
-from liex_lab.pipelines.origin import animal_of
 
 from liex_lab.errors import EstimationError, MisfitError
 from liex_lab.optics.camera import KINECT_V2
@@ -127,7 +127,7 @@ def test_which_hand_it_is_is_found_by_the_error_that_is_half_as_large(
     fitted = fit_plan(RECORDING, Plan.load("hand"))
     assert fitted.plan.recording.mirrored is True
     assert fitted.recording.optics["mirrored"]
-    assert "left hand or mirrored pictures" in fitted.notes[0]
+    assert "left hand or mirrored images" in fitted.notes[0]
     looks(monkeypatch, hand=HAND, hand_mirrored=replace(HAND, error_mm=13.0))
     fitted = fit_plan(RECORDING, Plan.load("hand"))
     assert fitted.plan.recording.mirrored is False

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from liex_lab.pipelines.evaluation.speed import evaluate_live, to_and_fro
-from liex_lab.pipelines.live import follow_live, open_live
+from liex_lab.pipelines.live import open_live, track_live
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
@@ -50,7 +50,7 @@ def test_skeletons_are_told_as_frames_come_and_the_whole_track_at_the_end():
     arriving = open_live(
         "synthetic:walk?seed=3&frames=48&sensor=kinect-v2&spine_mm=70", PLAN, replay=True
     )
-    numbers, tracked = follow_live(arriving, PLAN, learn_frames=36, viewer=lambda *_: View())
+    numbers, tracked = track_live(arriving, PLAN, learn_frames=36, viewer=lambda *_: View())
     assert closed == [True]
     assert [index for index, _ in shown] == list(range(48))
     assert sum(posed for _, posed in shown) >= 44
@@ -140,6 +140,7 @@ def test_frames_go_to_and_fro_and_keep_the_time_when_they_came():
     assert [arrival.at_s for arrival in _stamped(iter(frames))] == [0.0, 0.1, 0.2]
 
 
+@pytest.mark.nightly  # at the pace of the cameras
 def test_cameras_that_film_at_once_have_an_animal_each_and_the_pace_that_is_asked_for():
     told = evaluate_live("mouse", n_frames=200, rate_hz=60.0, n_cameras=2)
     assert told["rate_hz"] == pytest.approx(60.0, rel=1e-6)

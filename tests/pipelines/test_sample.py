@@ -13,7 +13,7 @@ import pytest
 from liex_lab.pipelines import sample
 
 from liex_lab import catalog
-from liex_lab.api import DEMO
+from liex_lab.catalog import DEMO
 from liex_lab.recordings import open_recording
 from liex_lab.sessions.provenance import package_version
 
@@ -53,7 +53,7 @@ def test_the_mouse_of_the_sample_walks_turns_and_rears() -> None:
     np.testing.assert_array_equal(np.diff(mouse.times_ns), 33_333_333)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_job_makes_the_sample_again(tmp_path: Path, card: dict[str, object]) -> None:
     made = sample.write_sample(tmp_path / DEMO)
     with open_recording(made) as again, open_recording(catalog.find_sample(DEMO)) as bundled:

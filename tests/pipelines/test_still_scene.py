@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.origin import build_background
+from liex_lab.pipelines.build import build_background
 
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording

@@ -14,51 +14,44 @@ from liex_lab import cli
 from liex_lab.sessions import Session
 from liex_lab.simulation.scenes.catalogue import film
 
-N_FRAMES = 90
+N_FRAMES = 60
 SEED = 3
 ADDRESS = f"synthetic:scene?name=two-animals&seed={SEED}&frames={N_FRAMES}"
 
 
+SAID = "2 animals are in view and one of them is followed"
+
+
 @pytest.fixture(scope="module")
-def studied(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A study of the one recording, measured: its folder, and what was printed."""
-    folder = tmp_path_factory.mktemp("two")
-    (folder / "raw").mkdir()
-    convert(ADDRESS, folder / "raw" / "two.mcap")
-    (folder / "study.toml").write_text(
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return convert(ADDRESS, tmp_path_factory.mktemp("raw") / "two.mcap").path
+
+
+@pytest.fixture(scope="module")
+def session(recording: Path) -> Session:
+    """The session of a run that ends well and reports both animals."""
+    result = CliRunner().invoke(cli.app, ["run", str(recording), "--out", str(recording.parent)])
+    assert result.exit_code == 0, result.output
+    assert SAID in result.output.strip().splitlines()[-1]
+    return Session.open(recording.with_suffix(".liex"))
+
+
+@pytest.mark.nightly
+def test_the_last_lines_and_the_table_of_a_study_report_both(
+    recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "study.toml").write_text(
         'name = "two"\n[[animals]]\nid = "m1"\ngroup = "a"\n'
-        '[[sessions]]\nanimal = "m1"\nsession = "01"\nrecording = "raw/two.mcap"\n'
+        f'[[sessions]]\nanimal = "m1"\nsession = "01"\nrecording = "{recording}"\n'
     )
-    result = CliRunner().invoke(cli.app, ["cohort", str(folder / "study.toml"), "--workers", "1"])
+    result = CliRunner().invoke(cli.app, ["cohort", str(tmp_path / "study.toml"), "--workers", "1"])
     assert result.exit_code == 0, result.output
-    return folder, result.output
-
-
-@pytest.fixture(scope="module")
-def session(studied: tuple[Path, str]) -> Session:
-    (found,) = studied[0].rglob("session.json")
-    return Session.open(found.parent)
-
-
-def test_the_studys_last_lines_and_its_table_say_what_the_session_says(
-    studied: tuple[Path, str],
-) -> None:
-    *_, told, counted = studied[1].strip().splitlines()
-    assert told.startswith("done")
-    assert "note: 2 animals are in view and one of them is followed" in told
+    *_, done, counted = result.output.strip().splitlines()
+    assert done.startswith("done")
+    assert f"note: {SAID}" in done
     assert counted == "1 session: 1 done with cautions"
-    (table,) = studied[0].rglob("study.csv")
+    (table,) = tmp_path.rglob("study.csv")
     assert "2 animals are in view" in table.read_text()
-
-
-def test_a_run_ends_well_and_says_that_there_are_two(
-    studied: tuple[Path, str], tmp_path: Path
-) -> None:
-    words = ["run", str(studied[0] / "raw" / "two.mcap"), "--out", str(tmp_path), "--no-depth"]
-    result = CliRunner().invoke(cli.app, words)
-    assert result.exit_code == 0, result.output
-    last = result.output.strip().splitlines()[-1]
-    assert "2 animals are in view and one of them is followed" in last
 
 
 def test_the_report_shows_the_one_that_is_not_measured_where_it_is(session: Session) -> None:

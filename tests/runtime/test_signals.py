@@ -94,7 +94,12 @@ def ended(work: str, *signals: int) -> tuple[int, str, str, float]:
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+    ("number", "code"),
+    [
+        (signal.SIGINT, 130),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.nightly),
+    ],
 )
 def test_what_is_under_way_is_put_down_and_said(number: int, code: int) -> None:
     returned, out, err, seconds = ended(TIDY, number)
@@ -131,7 +136,7 @@ def test_a_second_signal_ends_it_at_once() -> None:
 
 POOL = """
 import os, time, sys
-from liex_lab.pipelines.workers import Processes
+from liex_lab.runtime.processes import Processes
 def do(k):
     os.write(1, b"%d\\n" % os.getpid())  # in one piece: two workers write at once
     time.sleep(60)
@@ -149,8 +154,17 @@ def alive(pid: int) -> bool:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="there is no /proc")
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-@pytest.mark.parametrize("handled", [False, True])
+@pytest.mark.parametrize(
+    ("number", "handled"),
+    [
+        (signal.SIGKILL, False),
+        (signal.SIGINT, True),
+        pytest.param(signal.SIGKILL, True, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGTERM, True, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGTERM, False, marks=pytest.mark.nightly),
+        pytest.param(signal.SIGINT, False, marks=pytest.mark.nightly),
+    ],
+)
 def test_no_worker_is_left_behind(number: int, handled: bool, tmp_path: Path) -> None:
     work = "list(Processes(2, 1).each(do, [1, 2, 3]))"
     if handled:

@@ -32,7 +32,7 @@ def test_a_refused_run_says_its_sentence_and_ends_otherwise(monkeypatch):
     def refuse(*arguments, **settings):
         raise EstimationError("no floor was found")
 
-    monkeypatch.setattr(scenes, "measure_session", refuse)
+    monkeypatch.setattr(scenes, "run_session", refuse)
     row = evaluate_scenes(["two-arenas"], n_frames=6)["rows"]["two-arenas"]
     assert (row["said"], row["exit_code"], row["found"]) == (["no floor was found"], 1, 0.0)
     assert row["ratio_to_plain"] is None

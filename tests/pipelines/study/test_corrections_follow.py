@@ -43,7 +43,7 @@ def session(tmp_path: Path) -> PlannedSession:
 
 def correct(one: PlannedSession, action: str, start_s: float) -> None:
     edit = ask.add_bout(Session.open(one.folder), action, start_s, start_s + 0.05, new_word=True)
-    correct_session(one.folder, [edit])
+    correct_session(one.folder, [edit], report=False)
 
 
 def fails(one: PlannedSession) -> None:

@@ -1,0 +1,141 @@
+"""Figures and videos: `liex figures`, `liex export --to video`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from liex_lab.dashboards.figures import sets
+from liex_lab.dashboards.report.report import write_report
+from liex_lab.dashboards.video.video import write_clips, write_session
+
+from liex_lab.errors import SessionError
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions import Session
+from liex_lab.sessions.session import stretch, video_path
+
+from .compare import comparison_figures, find_sessions
+from .study.run import list_sessions
+
+
+def draw_figures(
+    place: str | Path,
+    *,
+    only: Sequence[str] = (),
+    formats: Sequence[str] = ("svg", "pdf"),
+    out: str | Path | None = None,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Draw the figures of a session, a study or a comparison as files.
+
+    Figures are one or two journal columns wide, texts are editable, and the same tables give the
+    same bytes.
+
+    Args:
+        place: a session folder; a study file, its folder, or a folder that contains sessions; or
+            the folder of a comparison.
+        only: names of figures, such as 'occupancy', or measures of a comparison; () draws all.
+        formats: some of svg, pdf and png; 'pages' is a single file figures.pdf with all figures.
+        out: the output folder; None uses `figures` next to the data.
+        progress: receives the name of each figure.
+
+    Returns:
+        `files`: the paths; `empty`: names of figures without data; `folder`.
+
+    Raises:
+        SessionError: there is no such figure or format, or no data to draw.
+        StudyError: there is no such session, study or comparison.
+    """
+    path = Path(place)
+    folder = path if path.is_dir() else path.parent
+    sets.check_kinds(formats)
+    if (path / "session.json").is_file():
+        sets.check_names(only, list(sets.OF_SESSION))
+        drawn = sets.session_figures(Session.open(path), only)
+    elif (path / sets.COMPARISON_FILE).is_file():
+        drawn = comparison_figures(path, only)
+    else:
+        sets.check_names(only, list(sets.OF_STUDY))
+        _, look = list_sessions(path)
+        folders = [entry.folder for entry in look() if entry.folder is not None]
+        if not folders:
+            raise SessionError(
+                f"no session of {path} has been measured; `liex cohort` measures them"
+            )
+        drawn = sets.study_figures([Session.open(one) for one in folders], only)
+    target = folder / sets.FOLDER if out is None else Path(out)
+    files, empty = sets.write_figures(drawn, target, formats, progress)
+    if not files:
+        raise SessionError(
+            f"{path} holds nothing to draw of {', '.join(empty)}: no pose was found, or too few "
+            "actions; its report says why"
+        )
+    return {"files": files, "empty": empty, "folder": target}
+
+
+def export_video(
+    places: str | Path | Sequence[str | Path],
+    out: str | Path | None = None,
+    *,
+    actions: Sequence[str] = (),
+    groups: Sequence[str] = (),
+    start_s: float | None = None,
+    stop_s: float | None = None,
+    slower: float = 1.0,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Path:
+    """Write a video (H.264): height above the floor, skeleton, trail, action and time.
+
+    One session is shown from beginning to end, on its own clock; several are shown side by side, by
+    group. With `actions`, the video contains clips of these bouts, aligned at the onsets; a
+    session's report links to the videos in its folder.
+
+    Args:
+        places: a session folder, several, or folders that contain sessions at any depth.
+        out: the output folder; None uses the session's own, or the current folder for several.
+        actions: actions, or prefixes of them: rear includes rear_supported and rear_unsupported.
+        groups: only sessions of these groups; () includes all.
+        start_s: start of a stretch of one session, s.
+        stop_s: end of that stretch, s.
+        slower: slow-motion factor.
+        overwrite: replace an existing file.
+        progress: receives progress reports.
+
+    Returns:
+        Path of the video.
+
+    Raises:
+        SessionError: a session has no depth, no bout has such a name, this PyAV has no encoder, or
+            the file exists.
+    """
+    given = [places] if isinstance(places, str | Path) else list(places)
+    opened = [Session.open(folder) for folder in find_sessions(given)]
+    named = [(session, str(session.table("sessions")["group"].iloc[0] or "")) for session in opened]
+    chosen = [pair for pair in named if not groups or pair[1] in groups]
+    if not chosen:
+        there = ", ".join(sorted({group for _, group in named} - {""})) or "none"
+        raise SessionError(f"no session is of {' or '.join(groups)}; their groups are {there}")
+    part = start_s is not None or stop_s is not None
+    if part and (len(chosen) > 1 or actions):
+        raise SessionError("a stretch of time is shown of one session, without actions")
+    if not slower > 0:
+        raise SessionError(f"slower is a number above 0, such as 4, got {slower:g}")
+    alone = chosen[0][0]
+    folder = Path(out) if out is not None else alone.path if len(chosen) == 1 else Path()
+    what = stretch(start_s, stop_s) if part else "+".join(actions)
+    path = video_path(folder, alone.name if len(chosen) == 1 else "sessions", what)
+    if path.exists() and not overwrite:
+        raise SessionError(
+            f"{path} exists already; name another place with --out, or say --overwrite (in Python "
+            "out= and overwrite=True)"
+        )
+    if len(chosen) == 1 and not actions:
+        return write_session(
+            alone, path, start_s=start_s, stop_s=stop_s, slower=slower, progress=progress
+        )
+    write_clips(chosen, path, actions, slower=slower, progress=progress)
+    if folder == alone.path:
+        write_report(folder)  # which links to it
+    return path
