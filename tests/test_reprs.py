@@ -21,13 +21,13 @@ def test_a_session_says_its_animal_its_length_and_its_tables(tmp_path: Path) -> 
 
 def test_a_plan_says_what_is_unlike_the_defaults() -> None:
     plan = liex_lab.Plan()
-    assert repr(plan) == "<Plan for the mouse, all else by default>"
+    assert repr(plan) == "<Plan for the mouse, default settings>"
     changed = plan.with_settings(["animal.spine_mm=65", "seed=3"])
     assert repr(plan.with_settings(["arenas=auto"])) == (
-        "<Plan for the mouse; unlike the defaults: arenas=auto>"
+        "<Plan for the mouse; changed settings: arenas=auto>"
     )
     assert repr(changed) == (
-        "<Plan for the mouse; unlike the defaults: seed=3, animal.spine_mm=65.0>"
+        "<Plan for the mouse; changed settings: seed=3, animal.spine_mm=65.0>"
     )
 
 
