@@ -123,6 +123,11 @@ def test_things_that_touch_the_animal_in_the_image_do_not_change_it(name: str) -
     np.testing.assert_array_equal(crops.n_px, same.n_px)
     np.testing.assert_array_equal(crops.heights, same.heights)
     np.testing.assert_array_equal(crops.moments, same.moments)
+    if "beam in front" in name:
+        bare = known.extract(bar()[None], 1.0, camera_view=True)
+        assert crops.n_px[0] > 0.5 * bare.n_px[0]
+        whole = known.extract(np.rint(frame[None]).astype(np.uint16), 1.0, camera_view=True)
+        np.testing.assert_array_equal(whole.n_px, crops.n_px)
 
 
 def test_readings_missing_across_the_body_do_not_part_it():
