@@ -101,9 +101,6 @@ class FrameTracker:
             adapt: fit a shape to the sample; else the body is the average one at its best girth.
             stated: a stated shape of the animal; None fits it.
 
-        Returns:
-            The tracker.
-
         Raises:
             EstimationError: no sampled frame shows an animal.
         """
