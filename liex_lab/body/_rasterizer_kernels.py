@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 NEAR_MM = 1.0
 
@@ -110,9 +110,9 @@ def to_depth(inverse, depth):
             depth[row, column] = 1.0 / value if value > 0.0 else 0.0
 
 
-@njit(cache=True)
-def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth images of n meshes in sequence; see `draw`.
+@njit(cache=True, nogil=True)
+def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth, start, stop):
+    """Depth images of n meshes; see `draw`.
 
     Args:
         vertices: (n, V, 3) mm.
@@ -122,41 +122,12 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
         intrinsics: (n, 4) fx, fy, cx, cy px.
         origin: (n, 2) image pixel (u, v) at the window's top left.
         depth: (n, H, W) mm, out; 0 for empty pixels.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
     inverse = np.empty(depth.shape[1:])
-    for i in range(len(vertices)):
+    for i in range(start, stop):
         inverse[:] = 0.0
-        draw(
-            vertices[i],
-            faces,
-            rotation[i],
-            translation[i],
-            intrinsics[i, 0],
-            intrinsics[i, 1],
-            intrinsics[i, 2],
-            intrinsics[i, 3],
-            origin[i, 0],
-            origin[i, 1],
-            inverse,
-        )
-        to_depth(inverse, depth[i])
-
-
-@njit(cache=True, parallel=True, nogil=True)
-def draw_batch_parallel(vertices, faces, rotation, translation, intrinsics, origin, depth):
-    """Depth images of n meshes on all threads; see `draw`.
-
-    Args:
-        vertices: (n, V, 3) mm.
-        faces: (F, 3) int32, shared.
-        rotation: (n, 3, 3).
-        translation: (n, 3) mm.
-        intrinsics: (n, 4) fx, fy, cx, cy px.
-        origin: (n, 2) image pixel (u, v) at the window's top left.
-        depth: (n, H, W) mm, out; 0 for empty pixels.
-    """
-    for i in prange(len(vertices)):
-        inverse = np.zeros(depth.shape[1:])
         draw(
             vertices[i],
             faces,

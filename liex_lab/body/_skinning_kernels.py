@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.geometry._kernels import exp_so3
@@ -315,11 +315,23 @@ def skin_tube(
     _tail(joints, rotations, arc, girth, stations[0], tail, bends, frame, out, at)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def skin_tubes(
-    joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
+    joints,
+    rotations,
+    girth,
+    stations,
+    half_width,
+    half_height,
+    power,
+    blobs,
+    tail,
+    bends,
+    out,
+    start,
+    stop,
 ):
-    """`skin_tube` for a batch, in sequence.
+    """`skin_tube` for a batch.
 
     Args:
         joints: (n, J, 3) mm.
@@ -333,8 +345,10 @@ def skin_tubes(
         tail: (n, 3).
         bends: (n, TAIL_RINGS) rad.
         out: (n, V, 3) mm, out.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for i in range(len(joints)):
+    for i in range(start, stop):
         skin_tube(
             joints[i],
             rotations[i],
@@ -350,43 +364,8 @@ def skin_tubes(
         )
 
 
-@njit(cache=True, parallel=True)
-def skin_tubes_parallel(
-    joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
-):
-    """`skin_tube` for a batch, on all threads.
-
-    Args:
-        joints: (n, J, 3) mm.
-        rotations: (n, J, 3, 3).
-        girth: (n,).
-        stations: (R,), shared.
-        half_width: (n, R) mm.
-        half_height: (n, R) mm.
-        power: (n,).
-        blobs: (n, B, 6).
-        tail: (n, 3).
-        bends: (n, TAIL_RINGS) rad.
-        out: (n, V, 3) mm, out.
-    """
-    for i in prange(len(joints)):
-        skin_tube(
-            joints[i],
-            rotations[i],
-            girth[i],
-            stations,
-            half_width[i],
-            half_height[i],
-            power[i],
-            blobs[i],
-            tail[i],
-            bends[i],
-            out[i],
-        )
-
-
-@njit(cache=True, parallel=True)
-def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out):
+@njit(cache=True, nogil=True)
+def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out, start, stop):
     """Vertices of C tapered capsules, round at both ends, for a batch.
 
     Args:
@@ -398,8 +377,10 @@ def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out):
         offsets: (n, C, 2, 3) mm of the ends in the joints' frames.
         radii: (n, C, 2) mm.
         out: (n, V, 3) mm, out.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for i in prange(len(joints)):
+    for i in range(start, stop):
         at = 0
         frame = np.empty((4, 3))
         ends = np.empty((2, 3))

@@ -17,6 +17,7 @@ from liex_lab.body import _skinning_kernels as skinning_kernels
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
+from liex_lab.runtime.threads import in_parallel
 
 Array = NDArray[np.float64]
 
@@ -132,8 +133,17 @@ class Capsules:
         """
         body = self.broadcast(len(positions))
         out = np.empty((len(positions), self.n_vertices, 3))
-        skinning_kernels.skin_capsules(
-            rotations, positions, scale, girth, self.joints, body.offsets, body.radii, out
+        in_parallel(
+            skinning_kernels.skin_capsules,
+            len(positions),
+            rotations,
+            positions,
+            scale,
+            girth,
+            self.joints,
+            body.offsets,
+            body.radii,
+            out,
         )
         return out
 

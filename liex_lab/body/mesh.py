@@ -15,13 +15,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.runtime.shapes import check_index, check_shapes
+from liex_lab.runtime.threads import in_parallel
 
 Array = NDArray[np.float64]
 
@@ -158,7 +159,9 @@ class MeshBody:
         body = self.broadcast(n)
         out = np.empty((len(positions), self.n_vertices, 3))
         carrier = skeleton.parents[self.bones]
-        _skin_mesh(
+        in_parallel(
+            _skin_mesh,
+            n,
             rotations,
             positions,
             scale,
@@ -174,12 +177,24 @@ class MeshBody:
         return out
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _skin_mesh(
-    rotations, positions, scale, girth, carrier, bones, weight, along, across, width, out
+    rotations,
+    positions,
+    scale,
+    girth,
+    carrier,
+    bones,
+    weight,
+    along,
+    across,
+    width,
+    out,
+    start,
+    stop,
 ):
     """Linear blend skinning of a batch into out (n, V, 3); carrier (V, B) joints."""
-    for i in prange(len(positions)):
+    for i in range(start, stop):
         for v in range(len(weight)):
             for axis in range(3):
                 out[i, v, axis] = 0.0

@@ -25,13 +25,14 @@ from liex_lab.errors import LiexError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_index, check_shapes
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.threads import in_parallel, threads
 
 Array = NDArray[np.float64]
 Body = BodyShape | Capsules | MeshBody
 Window = tuple[int, int, int, int]
 # distance of the silhouette's camera, in reaches of the body, and size of its image, px
 _FAR = 50.0
+_FEW = 16  # bodies: fewer are not worth threads
 _SILHOUETTE_PX = 400
 
 
@@ -206,24 +207,22 @@ class Surface:
             if bends is None
             else np.asarray(bends, float)
         )
-        skin = (
-            skinning_kernels.skin_tubes_parallel
-            if parallel and n > 16
-            else skinning_kernels.skin_tubes
-        )
-        skin(
-            joints,
-            rotations,
-            size,
-            self.stations,
-            body.half_width,
-            body.half_height,
-            body.power,
-            body.blobs,
-            body.tail,
-            turns,
-            out,
-        )
+        with threads(parallel and n > _FEW):
+            in_parallel(
+                skinning_kernels.skin_tubes,
+                n,
+                joints,
+                rotations,
+                size,
+                self.stations,
+                body.half_width,
+                body.half_height,
+                body.power,
+                body.blobs,
+                body.tail,
+                turns,
+                out,
+            )
         return out.reshape(*batch, -1, 3)
 
     def render(
@@ -328,16 +327,18 @@ def render_meshes(
     )
     check_index("vertices", faces, vertices.shape[1])
     depth = np.empty((n, size[1], size[0]), np.float32)
-    drive = rasterizer_kernels.draw_batch_parallel if parallel else rasterizer_kernels.draw_batch
-    drive(
-        vertices,
-        faces,
-        T_camera_mesh.rotation,
-        T_camera_mesh.translation,
-        np.asarray(intrinsics, float),
-        np.asarray(origin, float),
-        depth,
-    )
+    with threads(parallel):
+        in_parallel(
+            rasterizer_kernels.draw_batch,
+            n,
+            vertices,
+            faces,
+            T_camera_mesh.rotation,
+            T_camera_mesh.translation,
+            np.asarray(intrinsics, float),
+            np.asarray(origin, float),
+            depth,
+        )
     return depth
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from liex_lab.estimation._feature_kernels import (
     N_SCALARS,
@@ -149,16 +149,18 @@ def mode_of_votes(votes, bandwidth, out):
             out[k] = shifted[k] / total
 
 
-@njit(cache=True, parallel=True)
-def modes_of_votes(votes, bandwidth, modes):
+@njit(cache=True, nogil=True)
+def modes_of_votes(votes, bandwidth, modes, start, stop):
     """Mean-shift modes of the votes of n samples, each from the mean of its own.
 
     Args:
         votes: (n, T, D) votes.
         bandwidth: of the kernel, in units of the votes.
         modes: (n, D) float64, filled.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for k in prange(len(votes)):
+    for k in range(start, stop):
         for d in range(votes.shape[2]):
             modes[k, d] = 0.0
             for t in range(votes.shape[1]):
@@ -469,11 +471,23 @@ def _estimate_block(
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@njit(cache=True, nogil=True)
 def estimate_all(
-    batch, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
+    batch,
+    frames,
+    tree,
+    regressors,
+    pruner,
+    metric,
+    tuning,
+    body,
+    starts,
+    poses,
+    scores,
+    start,
+    stop,
 ):
-    """Run Lie-X Algorithm 1 for all frames with an animal, in parallel.
+    """Run Lie-X Algorithm 1 for blocks of `FRAMES` frames with an animal.
 
     Args:
         batch: `FrameBatch`.
@@ -488,9 +502,10 @@ def estimate_all(
         poses: `CandidatePoses` of the P kept candidates; filled, except in frames without an
             animal.
         scores: (n, P) of the kept candidates; filled likewise.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    n_blocks = (frames.size + FRAMES - 1) // FRAMES
-    for b in prange(n_blocks):
+    for b in range(start, stop):
         _estimate_block(
             batch,
             frames[b * FRAMES : (b + 1) * FRAMES],

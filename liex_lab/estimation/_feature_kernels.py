@@ -15,7 +15,7 @@ or the upright camera frame of the paper's variant.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from liex_lab.forests._kernels import (
     COLUMN_SLOPE,
@@ -230,8 +230,8 @@ def place_rest(solved, tree, scale, rotations, positions):
             place_joint(j, tree, scale, rotations, positions)
 
 
-@njit(cache=True, parallel=True)
-def place_all(j, tree, scale, rotations, positions):
+@njit(cache=True, nogil=True)
+def place_all(j, tree, scale, rotations, positions, start, stop):
     """`place_joint` for a batch of candidates.
 
     Args:
@@ -240,14 +240,28 @@ def place_all(j, tree, scale, rotations, positions):
         scale: (n,) of the bones.
         rotations: (n, J, 3, 3) joint frames, changed in place.
         positions: (n, J, 3) joints, mm, changed in place.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(scale.size):
+    for s in range(start, stop):
         place_joint(j, tree, scale[s], rotations[s], positions[s])
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def all_features(
-    joints, crop_cameras, moments, image, size, reach, rotations, positions, scale, views, scalars
+    joints,
+    crop_cameras,
+    moments,
+    image,
+    size,
+    reach,
+    rotations,
+    positions,
+    scale,
+    views,
+    scalars,
+    start,
+    stop,
 ):
     """Features of a batch of candidates: views from the given joints and scalars from the first.
 
@@ -263,8 +277,10 @@ def all_features(
         scale: (n,) of the bones.
         views: (n, V, 9) float32, filled.
         scalars: (n, N_SCALARS) float32, filled unless it has no columns.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(scale.size):
+    for s in range(start, stop):
         i = image[s]
         for v in range(joints.size):
             fill_view(
@@ -286,8 +302,8 @@ def all_features(
             )
 
 
-@njit(cache=True, parallel=True)
-def correct_base_all(rotations, positions, scale, values, levers, size):
+@njit(cache=True, nogil=True)
+def correct_base_all(rotations, positions, scale, values, levers, size, start, stop):
     """`correct_base` for a batch of candidates.
 
     Args:
@@ -297,8 +313,10 @@ def correct_base_all(rotations, positions, scale, values, levers, size):
         values: (n, 6 or 7) twist and, with 7, log scale, in lever units.
         levers: (2,) lever arms of rotation and log scale, mm.
         size: (n,) the animals' size over home size.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(scale.size):
+    for s in range(start, stop):
         twist = np.zeros(7)
         for k in range(3):
             twist[k] = values[s, k] / levers[0]
@@ -308,8 +326,8 @@ def correct_base_all(rotations, positions, scale, values, levers, size):
         scale[s] = correct_base(rotations[s, 0], positions[s, 0], scale[s], twist, size[s])
 
 
-@njit(cache=True, parallel=True)
-def correct_joint_all(j, rotations, axes, values, lever):
+@njit(cache=True, nogil=True)
+def correct_joint_all(j, rotations, axes, values, lever, start, stop):
     """`correct_joint` of one joint for a batch of candidates.
 
     Args:
@@ -318,8 +336,10 @@ def correct_joint_all(j, rotations, axes, values, lever):
         axes: (3,) bool, the joint's free axes.
         values: (n, free axes) rotations, rad times the lever arm.
         lever: the lever arm, mm.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(values.shape[0]):
+    for s in range(start, stop):
         correct_joint(rotations[s, j], axes, values[s], lever)
 
 
@@ -411,8 +431,8 @@ def end_past(heights, packed_camera, end, before, reach):
     return reach
 
 
-@njit(cache=True, parallel=True)
-def back_profiles(heights, crop_cameras, positions, length, most_share, out):
+@njit(cache=True, nogil=True)
+def back_profiles(heights, crop_cameras, positions, length, most_share, out, start, stop):
     """Profile of each chain: the back's height over all joints, and the extent past both ends.
 
     Args:
@@ -423,9 +443,11 @@ def back_profiles(heights, crop_cameras, positions, length, most_share, out):
         most_share: of the length; see `most` of `back_over`.
         out: (n, 2 J + 2) filled with heights (J), visible shares (J), and `end_past` of the first
             and the last joint, mm.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
     m = positions.shape[1]
-    for i in prange(positions.shape[0]):
+    for i in range(start, stop):
         here = np.empty(2)
         for k in range(m):
             back_over(heights[i], crop_cameras[i], positions[i, k], most_share * length[i], here)
@@ -442,8 +464,8 @@ def back_profiles(heights, crop_cameras, positions, length, most_share, out):
 # Numba kernel of the head-tail classifier: resamples a height map along an animal's direction.
 
 
-@njit(cache=True, parallel=True)
-def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out):
+@njit(cache=True, nogil=True)
+def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out, start, stop):
     """Resample height maps on a grid aligned with the animals.
 
     Grid point (a, b) is middle + size (along[a] d + across[b] d_left), d being the unit direction
@@ -459,9 +481,11 @@ def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out
         along: (A,) grid coordinates along the animal, mm at home size.
         across: (B,) grid coordinates to its left, mm at home size.
         out: (n, A, B) filled with heights, mm; 0 outside the animal.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
     last = heights.shape[1] - 1
-    for i in prange(len(middle)):
+    for i in range(start, stop):
         dx = tip[i, 0] - rump[i, 0]
         dy = tip[i, 1] - rump[i, 1]
         camera = crop_camera(crop_cameras[i])
@@ -482,8 +506,8 @@ def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out
 # Numba kernel of the mean cross-sections: a height map read across the mid-axis of a chain.
 
 
-@njit(cache=True, parallel=True)
-def read_across(heights, crop_cameras, points, sideways, lateral, seen, height):
+@njit(cache=True, nogil=True)
+def read_across(heights, crop_cameras, points, sideways, lateral, seen, height, start, stop):
     """Read height maps at distances to the left and right of points on the mid-axis.
 
     Args:
@@ -494,8 +518,10 @@ def read_across(heights, crop_cameras, points, sideways, lateral, seen, height):
         lateral: (T,) distances from the axis, mm.
         seen: (n, S, T) filled with the share of the two sides that shows the animal, 0 to 1.
         height: (n, S, T) filled with the mean height of those over the axis, mm, 0 without any.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for i in prange(points.shape[0]):
+    for i in range(start, stop):
         camera = crop_camera(crop_cameras[i])
         for s in range(points.shape[1]):
             for t in range(lateral.shape[0]):

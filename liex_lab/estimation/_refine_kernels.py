@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
 from liex_lab.geometry._kernels import cholesky, exp_so3, substitute
@@ -494,7 +494,7 @@ def refine_one(
     return scale
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def refine_all(
     heights,
     crop_cameras,
@@ -507,8 +507,10 @@ def refine_all(
     root_positions,
     angles,
     scales,
+    start,
+    stop,
 ):
-    """`refine_one` for the K poses of each of n frames, in parallel.
+    """`refine_one` for the K poses of each of n frames.
 
     Args:
         heights: (n, S, S) int16 height maps, 1/16 mm, 0 outside the animal.
@@ -522,8 +524,10 @@ def refine_all(
         root_positions: (n, K, 3) mm, changed in place.
         angles: (n, K, J, 3) rad, changed in place.
         scales: (n, K), changed in place.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for i in prange(len(scales)):
+    for i in range(start, stop):
         readings = Readings(
             _readings(heights[i], crop_cameras[i]),
             np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32),

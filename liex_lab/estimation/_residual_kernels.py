@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from liex_lab.scene._blob_kernels import ANGLE
 from liex_lab.scene._height_map_kernels import crop_camera, to_pixel, to_point
@@ -209,11 +209,11 @@ def explain_pose(heights, packed_camera, axis, rotations, positions, scale, size
     )
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def explain_all(
-    heights, crop_cameras, moments, image, rotations, positions, scale, size, body, out
+    heights, crop_cameras, moments, image, rotations, positions, scale, size, body, out, start, stop
 ):
-    """`explain_pose` for a batch of poses, in parallel.
+    """`explain_pose` for a batch of poses.
 
     Args:
         heights: (m, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
@@ -226,8 +226,10 @@ def explain_all(
         size: (n,) the animals' size over home size.
         body: the sphere model.
         out: (n, N_FIT) float32, filled.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(len(image)):
+    for s in range(start, stop):
         i = image[s]
         explain_pose(
             heights[i],

@@ -32,6 +32,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict, predict_each
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.shapes import check_index, check_shapes
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene._blob_kernels import N_MOMENTS
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 
@@ -160,7 +161,9 @@ class Cascade:
             candidates: changed in place.
             joint: number of the joint.
         """
-        kernels.place_all(
+        in_parallel(
+            kernels.place_all,
+            len(candidates),
             joint,
             KinematicTree.of(self.skeleton),
             candidates.scale,
@@ -210,7 +213,7 @@ class Cascade:
             return predict(forest, samples, in_bag)
         votes = predict_each(forest, samples)
         modes = np.empty((len(samples), votes.shape[2]))
-        modes_of_votes(votes, self.method.mean_shift_mm, modes)
+        in_parallel(modes_of_votes, len(votes), votes, self.method.mean_shift_mm, modes)
         return modes.astype(np.float32)
 
     def place_ends(self, candidates: Candidates) -> None:
@@ -234,7 +237,9 @@ class Cascade:
         n = len(candidates)
         views = np.empty((n, len(joints), VIEW), np.float32)
         scalars = np.empty((n, kernels.N_SCALARS), np.float32)
-        kernels.all_features(
+        in_parallel(
+            kernels.all_features,
+            n,
             np.array(joints),
             images.crop_cameras,
             images.moments,
@@ -287,10 +292,27 @@ class Cascade:
         method = self.method
         if joint == 0:
             levers = np.array([method.base_lever_mm, method.scale_lever_mm])
-            kernels.correct_base_all(c.rotations, c.positions, c.scale, values, levers, c.size)
+            in_parallel(
+                kernels.correct_base_all,
+                len(c),
+                c.rotations,
+                c.positions,
+                c.scale,
+                values,
+                levers,
+                c.size,
+            )
         else:
             axes = self.skeleton.axes[joint]
-            kernels.correct_joint_all(joint, c.rotations, axes, values, method.joint_lever_mm)
+            in_parallel(
+                kernels.correct_joint_all,
+                len(c),
+                joint,
+                c.rotations,
+                axes,
+                values,
+                method.joint_lever_mm,
+            )
 
     def labels(
         self, candidates: Candidates, joint: int, truth: Truth
@@ -348,7 +370,9 @@ def residuals(
 ) -> NDArray[np.float32]:
     """Residuals (n, N_FIT) of n posed bodies against their height maps."""
     out = np.empty((len(candidates), residual_kernels.N_FIT), np.float32)
-    residual_kernels.explain_all(
+    in_parallel(
+        residual_kernels.explain_all,
+        len(candidates),
         images.heights,
         images.crop_cameras,
         images.moments,

@@ -40,7 +40,7 @@ from liex_lab.estimation.refine import (
 )
 from liex_lab.estimation.scoring import Chosen, choose, corrected, with_best, with_expected_error
 from liex_lab.forests.forest import Forest
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.threads import in_parallel, threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
 
 Array = NDArray[np.float64]
@@ -267,7 +267,9 @@ class PoseEstimator:
         )
         scores = np.full(kept[:2], np.inf)
         with threads(parallel):
-            kernels.estimate_all(
+            in_parallel(
+                kernels.estimate_all,
+                -(-int(crops.found.sum()) // kernels.FRAMES),
                 kernels.FrameBatch(crops.heights, crop_cameras, crops.moments, size),
                 np.flatnonzero(crops.found),
                 KinematicTree.of(skeleton),

@@ -21,6 +21,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict_each
 from liex_lab.forests.grow import grow_forest
 from liex_lab.geometry import so3
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.height_maps import moment_columns
 
 Array = NDArray[np.float64]
@@ -159,7 +160,9 @@ def views_along_axis(
     each = size[image]
     views = np.empty((N_DIRECTIONS * m, 1, VIEW), np.float32)
     scalars = np.empty((N_DIRECTIONS * m, kernels.N_SCALARS), np.float32)
-    kernels.all_features(
+    in_parallel(
+        kernels.all_features,
+        len(image),
         np.zeros(1, np.int64),
         images.crop_cameras,
         images.moments,

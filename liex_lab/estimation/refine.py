@@ -48,6 +48,7 @@ from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation.cascade import Candidates, ImageSet, body_of, residuals
 from liex_lab.geometry import SE3
 from liex_lab.mlp import Network, descend
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]
@@ -121,7 +122,9 @@ class Refiner:
         weights = kernels.ResidualWeights(
             _ROBUST_MM * unit, _BESIDE, *(_PRIOR * np.array([unit**2, 1.0, unit**2, unit**2]))
         )
-        kernels.refine_all(
+        in_parallel(
+            kernels.refine_all,
+            len(moved.scale),
             heights,
             crop_cameras,
             self.tree,
@@ -340,7 +343,9 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
     n, j, _ = joints.shape
     length = skeleton.length * size
     profile = np.empty((n, 2 * j + 2))
-    feature_kernels.back_profiles(
+    in_parallel(
+        feature_kernels.back_profiles,
+        n,
         images.heights,
         images.crop_cameras,
         np.ascontiguousarray(joints),
@@ -531,7 +536,9 @@ def laid_along(
     along = np.arange(-_ALONG_MM, _ALONG_MM + 1e-6, _STEP_MM) * unit
     across = np.arange(-_ACROSS_MM, _ACROSS_MM + 1e-6, _STEP_MM) * unit
     out = np.empty((len(joints), len(along), len(across)))
-    feature_kernels.lay_along(
+    in_parallel(
+        feature_kernels.lay_along,
+        len(joints),
         images.heights,
         images.crop_cameras,
         joints[:, 0],

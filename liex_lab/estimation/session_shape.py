@@ -30,6 +30,7 @@ from liex_lab.body.surface import Surface, joint_reaches
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.refine import ridge_regression
 from liex_lab.geometry import SE3
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]
@@ -83,7 +84,9 @@ def cross_sections(
     lateral = (np.arange(N_LATERAL) + 0.5) / N_LATERAL * reach
     covered = np.empty((n, N_STATIONS, N_LATERAL))
     height = np.empty_like(covered)
-    kernels.read_across(heights, crop_cameras, points, sideways, lateral, covered, height)
+    in_parallel(
+        kernels.read_across, n, heights, crop_cameras, points, sideways, lateral, covered, height
+    )
     length = skeleton.length * size
     shown = covered.sum(axis=0)
     mean = (covered * height).sum(axis=0) / np.maximum(shown, 0.5) / length

@@ -17,11 +17,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, VIEW, descend
 from liex_lab.runtime.shapes import check_index, check_shapes
+from liex_lab.runtime.threads import in_parallel
 
 Array = NDArray[np.float64]
 
@@ -265,7 +266,9 @@ def predict(
     bag = np.zeros((forest.n_trees, 1), np.bool_) if in_bag is None else in_bag
     if in_bag is not None:
         check_shapes("a forest", ("in_bag", bag, (forest.n_trees, len(samples.heights))))
-    _predict(
+    in_parallel(
+        _predict,
+        len(samples),
         forest.nodes,
         forest.roots,
         forest.leaves,
@@ -292,7 +295,9 @@ def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
     """
     check_samples(forest, samples)
     out = np.empty((len(samples), forest.n_trees, forest.leaves.shape[1]), np.float32)
-    _predict_each(
+    in_parallel(
+        _predict_each,
+        len(samples),
         forest.nodes,
         forest.roots,
         forest.leaves,
@@ -306,9 +311,11 @@ def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
     return out
 
 
-@njit(cache=True, parallel=True)
-def _predict_each(nodes, roots, leaves, heights, image, inverse_size, views, scalars, out):
-    for s in prange(image.size):
+@njit(cache=True, nogil=True)
+def _predict_each(
+    nodes, roots, leaves, heights, image, inverse_size, views, scalars, out, start, stop
+):
+    for s in range(start, stop):
         for t in range(roots.size):
             leaf = descend(
                 nodes, roots[t], heights[image[s]], inverse_size[s], views[s], scalars[s]
@@ -316,11 +323,13 @@ def _predict_each(nodes, roots, leaves, heights, image, inverse_size, views, sca
             out[s, t] = leaves[leaf]
 
 
-@njit(cache=True, parallel=True)
-def _predict(nodes, roots, leaves, heights, image, inverse_size, views, scalars, in_bag, out):
+@njit(cache=True, nogil=True)
+def _predict(
+    nodes, roots, leaves, heights, image, inverse_size, views, scalars, in_bag, out, start, stop
+):
     n_trees = roots.size
     n_values = leaves.shape[1]
-    for s in prange(image.size):
+    for s in range(start, stop):
         i = image[s]
         column = i if in_bag.shape[1] > 1 else 0
         n_used = 0

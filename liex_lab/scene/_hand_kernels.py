@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from liex_lab.scene import _blob_kernels as blob_kernels
 from liex_lab.scene._blob_kernels import BLOCK
@@ -504,7 +504,7 @@ def extract_one(depth, n_candidates, sight, crops, k):
         if rank < n_alike:
             end = ends[ranked[rank]]
             surface = surfaces[labels[int(end[END_ROW]), int(end[END_COLUMN])]]
-            cut_end(depth, blocks, labels, surface, end, sight, crops, row)
+            cut_end(depth, blocks, labels, surface, end, sight, crops, k)
 
 
 @njit(cache=True)
@@ -613,9 +613,9 @@ def view_plane(rotation, distance, intrinsics):
     return np.array([a, b, -rotation[2, 2] / distance - a * intrinsics[2] - b * intrinsics[3]])
 
 
-@njit(cache=True, parallel=True)
-def extract_all(depths, n_candidates, sights, crops):
-    """Find the hand in every image and fill the batch, images in parallel.
+@njit(cache=True, nogil=True)
+def extract_all(depths, n_candidates, sights, crops, start, stop):
+    """Find the hand in every image and fill the batch.
 
     Args:
         depths: (n, H, W) mm, 0 where unread.
@@ -623,8 +623,10 @@ def extract_all(depths, n_candidates, sights, crops):
         sights: `HandSight` of the images: size, behind, smooth and intrinsics with a leading axis
             (n,).
         crops: `CropRows`, out.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for k in prange(depths.shape[0]):
+    for k in range(start, stop):
         sight = HandSight(
             sights.near,
             sights.far,
@@ -634,8 +636,7 @@ def extract_all(depths, n_candidates, sights, crops):
             sights.intrinsics[k],
             sights.along_axis,
         )
-        # of one type: the loop variable has two, and everything would be compiled twice
-        extract_one(depths[k], n_candidates, sight, crops, np.int64(k))
+        extract_one(depths[k], n_candidates, sight, crops, k)
 
 
 @njit(cache=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from liex_lab.scene import _blob_kernels as blob_kernels
 
@@ -44,8 +44,8 @@ class Sight(NamedTuple):
     smooth_mm: Any
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
+@njit(cache=True, nogil=True)
+def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas, start, stop):
     """Areas of the connected components of every frame; 0 for one that does not stand on the floor.
 
     Args:
@@ -55,8 +55,10 @@ def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas):
         bridge: unread blocks allowed between the parts of one component.
         mm2_per_px: 1 / (fx fy).
         areas: (n, MAX_BLOBS) mm^2, out; 0 on entry.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for k in prange(depths.shape[0]):
+    for k in range(start, stop):
         labels = np.empty(
             (depths.shape[1] // blob_kernels.BLOCK, depths.shape[2] // blob_kernels.BLOCK), np.int32
         )
@@ -210,7 +212,7 @@ def extract_one(depth, limit, on_floor, area, n_candidates, parts, sight, crops,
         if rank < n_near:
             slot = order[rank]
             blob = blob_kernels.unpack_blob(blobs[slot])
-            cut_crop(depth, limit, labels, slot, blob, sight, crops, row)
+            cut_crop(depth, limit, labels, slot, blob, sight, crops, k)
             crops.n_px[row] = int(blob.n_px)
 
 
@@ -272,9 +274,9 @@ def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
         )
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def extract_all(depths, limit, on_floor, area, n_candidates, parts, sight, crops):
-    """Find the animal in every frame of one camera and fill the batch, frames in parallel.
+@njit(cache=True, nogil=True)
+def extract_all(depths, limit, on_floor, area, n_candidates, parts, sight, crops, start, stop):
+    """Find the animal in every frame of one camera and fill the batch.
 
     Args:
         depths: (n, H, W) mm, 0 where unread.
@@ -285,16 +287,16 @@ def extract_all(depths, limit, on_floor, area, n_candidates, parts, sight, crops
         parts: whether layers far apart in depth are separated, see `parted`.
         sight: `Sight` of all images.
         crops: `CropRows`, out.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for k in prange(depths.shape[0]):
-        # of one type: the loop variable has two, and everything would be compiled twice
-        row = np.int64(k)
-        extract_one(depths[k], limit, on_floor, area, n_candidates, parts, sight, crops, row)
+    for k in range(start, stop):
+        extract_one(depths[k], limit, on_floor, area, n_candidates, parts, sight, crops, k)
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def extract_windows(depths, background, margin, area, n_candidates, sights, crops):
-    """Find the animal in image patches from many cameras and fill the batch, in parallel.
+@njit(cache=True, nogil=True)
+def extract_windows(depths, background, margin, area, n_candidates, sights, crops, start, stop):
+    """Find the animal in image patches from many cameras and fill the batch.
 
     The limit of each patch is its background, or the floor where that is unread, less its margin;
     all of it counts as floor.
@@ -308,8 +310,10 @@ def extract_windows(depths, background, margin, area, n_candidates, sights, crop
         sights: `Sight` of the patches, each field with a leading axis (n,), in pixels of the
             patches.
         crops: `CropRows`, out.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for k in prange(depths.shape[0]):
+    for k in range(start, stop):
         plane = sights.plane[k]
         limit = np.empty(depths.shape[1:], np.float32)
         everywhere = np.ones(depths.shape[1:], np.bool_)
@@ -327,8 +331,7 @@ def extract_windows(depths, background, margin, area, n_candidates, sights, crop
             sights.behind_mm[k],
             sights.smooth_mm[k],
         )
-        row = np.int64(k)
-        extract_one(depths[k], limit, everywhere, area[k], n_candidates, False, sight, crops, row)
+        extract_one(depths[k], limit, everywhere, area[k], n_candidates, False, sight, crops, k)
 
 
 # Pinhole projection of a crop: points of its view frame to its pixels, and pixels back to points.
@@ -500,8 +503,8 @@ def far_mode(values, window):
     return 0.0, 0.0
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def far_modes(ordered, window_share, window_mm, near_share, depth, spread, near):
+@njit(cache=True, nogil=True)
+def far_modes(ordered, window_share, window_mm, near_share, depth, spread, near, start, stop):
     """Background depth, its spread and the nearest usual depth of every pixel.
 
     Runs `far_mode` in every pixel, pixels in parallel.
@@ -515,8 +518,10 @@ def far_modes(ordered, window_share, window_mm, near_share, depth, spread, near)
         spread: (n_pixels,) float32 mm, out: its standard deviation.
         near: (n_pixels,) float32 mm, out: the `near_share` quantile of the readings, 0 where never
             read.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for pixel in prange(ordered.shape[0]):
+    for pixel in range(start, stop):
         first = 0
         while first < ordered.shape[1] and not ordered[pixel, first] > 0:
             first += 1

@@ -22,6 +22,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene.floor import Floor, near_plane, parts
 from liex_lab.scene.support_plane import (
@@ -152,7 +153,7 @@ def learn_background(
         ordered = np.ascontiguousarray(stack[:, rows].reshape(len(stack), -1).T)
         ordered.sort(axis=1)
         depth, spread, near = (np.ravel(one[rows]) for one in found)
-        kernels.far_modes(ordered, *numbers, depth, spread, near)
+        in_parallel(kernels.far_modes, len(ordered), ordered, *numbers, depth, spread, near)
     return found[0], found[1], found[2]
 
 

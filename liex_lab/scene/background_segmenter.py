@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, CameraView
 from liex_lab.optics.camera import Camera, SensorCard
 from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.threads import in_parallel, threads
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import MAX_BLOBS
 from liex_lab.scene.background import (
@@ -282,8 +282,15 @@ class BackgroundSubtraction(Segmenter):
         self._check(depths)
         areas = np.zeros((len(depths), MAX_BLOBS))
         bridge = 0 if self.view.frame == VIEWS[0] else kernels.BRIDGE
-        kernels.blob_areas(
-            depths, self.limit, self.on_floor, bridge, 1.0 / (self.grid.fx * self.grid.fy), areas
+        in_parallel(
+            kernels.blob_areas,
+            len(depths),
+            depths,
+            self.limit,
+            self.on_floor,
+            bridge,
+            1.0 / (self.grid.fx * self.grid.fy),
+            areas,
         )
         low = self.view.area[0] * spine_mm[0] ** 2
         high = self.view.area[1] * spine_mm[1] ** 2
@@ -353,7 +360,9 @@ class BackgroundSubtraction(Segmenter):
         crops = HeightMaps.blank(n_candidates * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):
-            kernels.extract_all(
+            in_parallel(
+                kernels.extract_all,
+                len(depths),
                 depths,
                 self.limit,
                 self.on_floor,

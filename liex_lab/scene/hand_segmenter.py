@@ -21,7 +21,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.threads import in_parallel, threads
 from liex_lab.scene import _hand_kernels as kernels
 from liex_lab.scene.background import sample_frames
 from liex_lab.scene.floor import Floor
@@ -267,7 +267,7 @@ def cut_nearest(
         intrinsics=intrinsics,
         along_axis=camera_view,
     )
-    kernels.extract_all(depths, n_candidates, sights, crops.rows)
+    in_parallel(kernels.extract_all, len(depths), depths, n_candidates, sights, crops.rows)
     return crops
 
 

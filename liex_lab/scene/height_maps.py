@@ -25,6 +25,7 @@ from liex_lab.body.skeleton import MOUSE_VIEW, CameraView
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.shapes import check_shapes
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import N_MOMENTS, BlobMoments
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA, CropCamera, CropRows
@@ -364,7 +365,9 @@ class Patches:
                 np.diag([1.0, -1.0, -1.0]) if camera_view else floor.T_arena_camera.rotation
             )
         crops = HeightMaps.blank(n_candidates * n, np.tile(distance, n_candidates))
-        kernels.extract_windows(
+        in_parallel(
+            kernels.extract_windows,
+            n,
             self.depth,
             self.background,
             margin,

@@ -13,12 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.height_maps import HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
 
@@ -39,14 +40,24 @@ def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
         (n,) 0 to 1; 0 if nothing was found.
     """
     out = np.zeros(len(crops.n_px))
-    _share_behind(crops.heights, crops.origin, crops.step, depths, _NEARER_MM, _REACH_PX, out)
+    in_parallel(
+        _share_behind,
+        len(out),
+        crops.heights,
+        crops.origin,
+        crops.step,
+        depths,
+        _NEARER_MM,
+        _REACH_PX,
+        out,
+    )
     return out
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out):
+@njit(cache=True, nogil=True)
+def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out, start, stop):
     """Fill out (n,) with the share of the edges of each height map (n, S, S) behind an object."""
-    for i in prange(heights.shape[0]):
+    for i in range(start, stop):
         size = heights.shape[1]
         n_edges = 0
         n_behind = 0
@@ -179,20 +190,31 @@ class OcclusionCorrection:
         ends = camera.project(joints[:, [0, self.skeleton.tip]])
         out = np.zeros((len(ends), 5))
         before = _BEFORE * float(np.sqrt(self.scene.area_mm2))
-        _look(crops.heights, crops.origin, crops.step, crops.distance, depths, ends, before, out)
+        in_parallel(
+            _look,
+            len(ends),
+            crops.heights,
+            crops.origin,
+            crops.step,
+            crops.distance,
+            depths,
+            ends,
+            before,
+            out,
+        )
         out[:, 0] /= camera.fx * camera.fy * self.scene.area_mm2
         return out
 
 
-@njit(cache=True, parallel=True)
-def _look(heights, origin, step, distance, depths, ends, before, out):
+@njit(cache=True, nogil=True)
+def _look(heights, origin, step, distance, depths, ends, before, out, start, stop):
     """Fill out (n, 5) with the visible pixels of each animal along its line from base to tip.
 
     ends (n, 2, 2) px are the line's ends. Columns: visible pixels times their squared depth; how
     many of them are next to an object nearer by `before` mm or to the image edge; the distance of
     these from the middle of all, over half the visible length; start and end of the visible part.
     """
-    for i in prange(heights.shape[0]):
+    for i in range(start, stop):
         size = heights.shape[1]
         depth = depths[i]
         line = ends[i, 1] - ends[i, 0]

@@ -17,12 +17,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.height_maps import CROP, HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
 from liex_lab.tracking.trust import MOST_ERROR, MOST_RESIDUAL, finite_median
@@ -109,8 +110,17 @@ class BodyResidual:
         joints = scene.camera.project(
             scene.floor.T_arena_camera.inverse() @ joints_of(self.surface.skeleton, pose_arena)
         )
-        _compare(
-            rendered, crops.heights, crops.origin, crops.step, planes, crops.distance, joints, out
+        in_parallel(
+            _compare,
+            n,
+            rendered,
+            crops.heights,
+            crops.origin,
+            crops.step,
+            planes,
+            crops.distance,
+            joints,
+            out,
         )
         return BodyAgreement(*out)
 
@@ -180,13 +190,13 @@ def render_crops(
     return render_meshes(vertices, surface.faces, T_camera_arena, scaled, origin, (CROP, CROP))
 
 
-@njit(cache=True, parallel=True)
-def _compare(rendered, heights, origin, step, planes, distance, joints, out):
+@njit(cache=True, nogil=True)
+def _compare(rendered, heights, origin, step, planes, distance, joints, out, start, stop):
     """Median |rendered - observed| depth, mm, over pixels where both are, the share of the observed
     pixels that are covered, the share of the rendered ones outside, and the largest median
     of a part of the body, into out (4, n). joints (n, J, 2) are px of the image.
     """
-    for i in prange(rendered.shape[0]):
+    for i in range(start, stop):
         size = rendered.shape[1]
         plane = planes[i]
         offset = np.empty(size * size)

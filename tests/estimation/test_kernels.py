@@ -11,6 +11,7 @@ from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.forests._kernels import VIEW
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, Camera
+from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import HeightMaps
@@ -96,7 +97,9 @@ def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
     )
     views, scalars = np.empty((n, 2, VIEW)), np.empty((n, kernels.N_SCALARS))
     reach = np.full(2, REACH)
-    kernels.all_features(
+    in_parallel(
+        kernels.all_features,
+        n,
         np.array([2, 0]),
         np.stack([window.look] * 2),
         moments,
@@ -185,7 +188,14 @@ def test_corrections_of_a_batch_count_in_levers_and_leave_the_scale_alone_withou
     for width in (6, 7):
         got_rotation, got_position, got_scale = rotations.copy(), positions.copy(), scale.copy()
         kernels.correct_base_all(
-            got_rotation, got_position, got_scale, values[:, :width], np.array([30.0, 50.0]), size
+            got_rotation,
+            got_position,
+            got_scale,
+            values[:, :width],
+            np.array([30.0, 50.0]),
+            size,
+            0,
+            4,
         )
         twist = values[:, :6].astype(float) * (1 / 30.0, 1 / 30.0, 1 / 30.0, 1, 1, 1)
         twist[:, 3:] *= size[:, None]

@@ -87,7 +87,7 @@ def test_the_kernel_agrees_with_the_loop_a_reader_would_write():
     sideways = rng.normal(size=(2, 3, 2))
     lateral = np.array([1.0, 4.0, 30.0])
     seen, height = np.empty((2, 3, 3)), np.empty((2, 3, 3))
-    kernels.read_across(heights, cameras, points, sideways, lateral, seen, height)
+    kernels.read_across(heights, cameras, points, sideways, lateral, seen, height, 0, 2)
     for i, s, t in np.ndindex(2, 3, 3):
         readings = []
         for side in (-1.0, 1.0):
