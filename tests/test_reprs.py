@@ -26,9 +26,7 @@ def test_a_plan_says_what_is_unlike_the_defaults() -> None:
     assert repr(plan.with_settings(["arenas=auto"])) == (
         "<Plan for the mouse; changed settings: arenas=auto>"
     )
-    assert repr(changed) == (
-        "<Plan for the mouse; changed settings: seed=3, animal.spine_mm=65.0>"
-    )
+    assert repr(changed) == ("<Plan for the mouse; changed settings: seed=3, animal.spine_mm=65.0>")
 
 
 def test_skeletons_transforms_and_recordings_are_one_line() -> None:

@@ -44,13 +44,13 @@ def functions_without_types(path: Path) -> list[str]:
     compiled = [
         ast.unparse(node)
         for node in nodes
-        if isinstance(node, ast.Call) and "njit" in ast.unparse(node.func)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in {"kernel", "inner_kernel"}
     ]
     untyped = []
     for node in nodes:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.returns is None:
             decorators = " ".join(ast.unparse(decorator) for decorator in node.decorator_list)
-            is_kernel = "njit" in decorators or any(
+            is_kernel = "kernel(" in decorators or any(
                 call.endswith(f"({node.name})") for call in compiled
             )
             untyped += [] if is_kernel else [f"{path}:{node.lineno} {node.name}"]
@@ -73,7 +73,7 @@ def kernels_of(path: Path) -> list[ast.FunctionDef]:
         node
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.FunctionDef)
-        and any("njit" in ast.unparse(decorator) for decorator in node.decorator_list)
+        and any("kernel(" in ast.unparse(decorator) for decorator in node.decorator_list)
     ]
 
 

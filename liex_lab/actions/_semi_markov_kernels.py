@@ -14,12 +14,13 @@ first state, with the total at the end; stay, leave (K,) log probabilities of th
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 _NEVER = -1e30
 
 
-@njit(cache=True)
+@kernel()
 def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, stayed):
     """Viterbi recursion over the ticks `start` to `stop` of a block; fills the back-pointers.
 
@@ -71,7 +72,7 @@ def go_on(start, stop, scores, first, stay, leave, switch, value, came_from, sta
             value[s] = fresh[s]
 
 
-@njit(cache=True)
+@kernel()
 def trace_back(first, value, came_from, stayed, label):
     """Viterbi backtracking: the most probable actions.
 
@@ -99,7 +100,7 @@ def trace_back(first, value, came_from, stayed, label):
             state = first[k + 1] - 1
 
 
-@njit(cache=True)
+@kernel()
 def probabilities(scores, first, stay, leave, switch, out):
     """Forward-backward algorithm: posteriors of the actions, normalised tick by tick.
 
@@ -168,7 +169,7 @@ def probabilities(scores, first, stay, leave, switch, out):
             back[s] = fresh[s] / every
 
 
-@njit(cache=True)
+@inner_kernel()
 def _likelihood(scores, t, like):
     """Likelihoods (K,) of tick t up to a factor, exp(scores minus their maximum), into `like`."""
     top = scores[t, 0]

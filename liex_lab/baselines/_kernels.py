@@ -9,11 +9,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from liex_lab.estimation._cascade_kernels import mode_of_votes
 from liex_lab.estimation._feature_kernels import correct_base, correct_joint, fill_view, place_joint
 from liex_lab.forests._kernels import VIEW, descend
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.scene._height_map_kernels import crop_camera
 
 _BINS = 72  # heading bins of the circle: 5 degrees each
@@ -53,7 +54,7 @@ class VoteSettings(NamedTuple):
     bandwidths: Any
 
 
-@njit(cache=True)
+@kernel()
 def animal_points(heights, packed_camera, phase, points):
     """Points on the animal's back, evenly spread over its pixels in reading order.
 
@@ -87,7 +88,7 @@ def animal_points(heights, packed_camera, phase, points):
             seen += 1
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def points_all(heights, crop_cameras, image, phases, points):
     """`animal_points` for a batch of images.
 
@@ -102,7 +103,7 @@ def points_all(heights, crop_cameras, image, phases, points):
         animal_points(heights[image[s]], crop_cameras[image[s]], phases[s], points[s])
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def views_all(crop_cameras, image, places, headings, reach, views):
     """Linearised projections at given positions, with offsets turned by a heading.
 
@@ -120,7 +121,7 @@ def views_all(crop_cameras, image, places, headings, reach, views):
         fill_view(turned, places[s], crop_cameras[image[s]], 1.0, reach, views[s, 0])
 
 
-@njit(cache=True)
+@inner_kernel()
 def turn_to(heading, rotation):
     """Rotation (3, 3) about the view's z axis by an angle `heading`, rad, into `rotation`."""
     c = np.cos(heading)
@@ -133,7 +134,7 @@ def turn_to(heading, rotation):
     rotation[2, 2] = 1.0
 
 
-@njit(cache=True)
+@kernel()
 def heading_of(votes):
     """The heading, rad, that most votes (n, 2) agree on; a vote's weight is its length.
 
@@ -157,7 +158,7 @@ def heading_of(votes):
     return np.arctan2(y, x)
 
 
-@njit(cache=True)
+@inner_kernel()
 def locate(heights, packed_camera, phase, settings, forest, used, place):
     """Position and heading of the animal by the votes of F1's trees.
 
@@ -213,7 +214,7 @@ def locate(heights, packed_camera, phase, settings, forest, used, place):
     return heading
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def locate_all(heights, crop_cameras, image, phases, settings, forest, used, places, headings):
     """`locate` for a batch of images, in parallel.
 
@@ -240,7 +241,7 @@ def locate_all(heights, crop_cameras, image, phases, settings, forest, used, pla
         )
 
 
-@njit(cache=True)
+@kernel()
 def unfold(values, levers, place, heading, tree, rotations, positions):
     """Joint frames of the pose at F2's coordinates, relative to F1's position and heading.
 
@@ -277,7 +278,7 @@ def unfold(values, levers, place, heading, tree, rotations, positions):
     return scale
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree, positions):
     """Joints of the frames in which an animal was found, in parallel.
 
@@ -325,7 +326,7 @@ def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree,
         unfold(values, levers, place, heading, tree, rotations, positions[i])
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def frames_all(heights, crop_cameras, frames):
     for k in prange(len(crop_cameras)):
         camera = crop_camera(crop_cameras[k])
@@ -349,7 +350,7 @@ def frames_all(heights, crop_cameras, frames):
         frames[k, 4] = frames[k, 2] * frames[k, 3] / np.sqrt(camera.fx * camera.fy)
 
 
-@njit(cache=True)
+@kernel()
 def shade(heights, row, column, level, per_mm):
     """Brightness of one pixel of a height map; `level` is the animal's mean height, 1/16 mm."""
     if (
@@ -362,7 +363,7 @@ def shade(heights, row, column, level, per_mm):
     )
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def patches_all(heights, crop_cameras, frames, patches):
     for k in prange(len(crop_cameras)):
         camera = crop_camera(crop_cameras[k])

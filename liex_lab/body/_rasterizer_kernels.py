@@ -12,12 +12,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 NEAR_MM = 1.0
 
 
-@njit(cache=True)
+@kernel()
 def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse):
     """Draw triangles into an image of inverse depth.
 
@@ -55,7 +56,7 @@ def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse
         _draw_triangle(projected, faces[f, 0], faces[f, 1], faces[f, 2], inverse)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _draw_triangle(p, a, b, c, inverse):
     """Draw the triangle of rows a, b, c of `p` (V, 3): pixel column, pixel row, 1 / z."""
     if p[a, 2] <= 0.0 or p[b, 2] <= 0.0 or p[c, 2] <= 0.0:
@@ -96,7 +97,7 @@ def _draw_triangle(p, a, b, c, inverse):
             wc += wc_u
 
 
-@njit(cache=True)
+@kernel()
 def to_depth(inverse, depth):
     """Depth from inverse depth; 0 for empty pixels.
 
@@ -110,7 +111,7 @@ def to_depth(inverse, depth):
             depth[row, column] = 1.0 / value if value > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth, start, stop):
     """Depth images of n meshes; see `draw`.
 

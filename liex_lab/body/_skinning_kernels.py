@@ -16,10 +16,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.geometry._kernels import exp_so3
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 BODY_SEGMENTS = 16
 BLOB_RINGS = 4
@@ -67,7 +67,7 @@ def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
     return np.concatenate(faces)
 
 
-@njit(cache=True)
+@inner_kernel()
 def spine_frame(joints, rotations, arc, station, out):
     """Centre, forward, left and up of the mid-axis at one station.
 
@@ -122,7 +122,7 @@ def spine_frame(joints, rotations, arc, station, out):
     _cross(out, 1, 2, 3)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _normalise(rows, k):
     """Scale row k of `rows` (., 3) to unit length."""
     length = math.sqrt(rows[k, 0] ** 2 + rows[k, 1] ** 2 + rows[k, 2] ** 2)
@@ -130,7 +130,7 @@ def _normalise(rows, k):
         rows[k, axis] /= length
 
 
-@njit(cache=True)
+@inner_kernel()
 def _cross(rows, a, b, out):
     """Set row `out` to the cross product of rows a and b of `rows` (., 3)."""
     x = rows[a, 1] * rows[b, 2] - rows[a, 2] * rows[b, 1]
@@ -141,7 +141,7 @@ def _cross(rows, a, b, out):
     rows[out, 2] = z
 
 
-@njit(cache=True)
+@inner_kernel()
 def chain_arc(joints, arc):
     """The chain's length up to each joint.
 
@@ -157,7 +157,7 @@ def chain_arc(joints, arc):
         arc[j] = arc[j - 1] + math.sqrt(square)
 
 
-@njit(cache=True)
+@kernel()
 def _body(
     joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, start
 ):
@@ -190,7 +190,7 @@ def _body(
     return at
 
 
-@njit(cache=True)
+@inner_kernel()
 def ellipsoid(frame, radii, out, start):
     """An ellipsoid's vertices.
 
@@ -223,7 +223,7 @@ def ellipsoid(frame, radii, out, start):
     return at
 
 
-@njit(cache=True)
+@inner_kernel()
 def _blob(joints, rotations, arc, girth, blob, frame, out, start):
     """One ear or foot: `blob` = station, left, up of its centre, its three radii, mm at scale 1;
     radius 0 hides it.
@@ -234,7 +234,7 @@ def _blob(joints, rotations, arc, girth, blob, frame, out, start):
     return ellipsoid(frame, girth * blob[3:6], out, start)
 
 
-@njit(cache=True)
+@kernel()
 def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
     """A tube that leaves the rump at station `first`, sinks to the floor z = 0 and turns by `bends`
     rad at its rings.
@@ -285,7 +285,7 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
     return at + 1
 
 
-@njit(cache=True)
+@inner_kernel()
 def skin_tube(
     joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
 ):
@@ -315,7 +315,7 @@ def skin_tube(
     _tail(joints, rotations, arc, girth, stations[0], tail, bends, frame, out, at)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def skin_tubes(
     joints,
     rotations,
@@ -364,7 +364,7 @@ def skin_tubes(
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out, start, stop):
     """Vertices of C tapered capsules, round at both ends, for a batch.
 
@@ -402,7 +402,7 @@ def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out, s
             )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _capsule(first, last, first_radius, last_radius, frame, out, start):
     """A tube around one bone: half its rings round off each end."""
     length = 0.0
@@ -443,7 +443,7 @@ def _capsule(first, last, first_radius, last_radius, frame, out, start):
 # Kernels of forward kinematics (product of exponentials) for many poses, without NumPy's overhead.
 
 
-@njit(cache=True)
+@kernel()
 def place_joints(tree, rotation, translation, angles, scale, out):
     """Positions of the joints of n poses; the kernel twin of `Pose.joints`.
 

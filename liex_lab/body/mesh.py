@@ -15,12 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
+from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.shapes import check_index, check_shapes
 from liex_lab.runtime.threads import in_parallel
 
@@ -177,7 +177,7 @@ class MeshBody:
         return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _skin_mesh(
     rotations,
     positions,

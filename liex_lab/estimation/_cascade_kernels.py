@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from liex_lab.estimation._feature_kernels import (
     N_SCALARS,
@@ -25,6 +24,7 @@ from liex_lab.estimation._feature_kernels import (
 from liex_lab.estimation._residual_kernels import N_FIT, explain_pose
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests._walk import LANES, walk_one_view, walk_views
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.scene._blob_kernels import ANGLE
 
 FRAMES = 8
@@ -122,7 +122,7 @@ class _Lanes(NamedTuple):
     pose: Any
 
 
-@njit(cache=True)
+@kernel()
 def mode_of_votes(votes, bandwidth, out):
     """Mean-shift mode of votes with a Gaussian kernel (Comaniciu and Meer 2002), in four steps.
 
@@ -149,7 +149,7 @@ def mode_of_votes(votes, bandwidth, out):
             out[k] = shifted[k] / total
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def modes_of_votes(votes, bandwidth, modes, start, stop):
     """Mean-shift modes of the votes of n samples, each from the mean of its own.
 
@@ -169,7 +169,7 @@ def modes_of_votes(votes, bandwidth, modes, start, stop):
         mode_of_votes(votes[k], bandwidth, modes[k])
 
 
-@njit(cache=True)
+@kernel()
 def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
     """A forest's prediction for n lanes into out (n, width): mean or mean-shift mode of the votes.
 
@@ -227,7 +227,7 @@ def _predict(trees, forest, lanes, n, n_views, side, bandwidth, out):
             mode_of_votes(votes[k], bandwidth, out[k, :width])
 
 
-@njit(cache=True)
+@inner_kernel()
 def _write_scalars(lanes, k, first, scalars):
     """Write a lane's scalars behind the pixels, from number `first` on, rounded down."""
     at = lanes.scalar_base[k] + first
@@ -237,7 +237,7 @@ def _write_scalars(lanes, k, first, scalars):
         )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _fill_inputs(lanes, n, joint, batch, reach, candidates):
     """Fill the lanes' only view, from one joint, and their scalars."""
     rotations = candidates.rotations
@@ -270,7 +270,7 @@ def _fill_inputs(lanes, n, joint, batch, reach, candidates):
         _write_scalars(lanes, s, 0, scalars)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _fill_all_inputs(lanes, n, batch, reach, body, candidates):
     """Fill the lanes' views from all joints, their scalars, and the residuals of the posed body."""
     rotations = candidates.rotations
@@ -314,7 +314,7 @@ def _fill_all_inputs(lanes, n, batch, reach, body, candidates):
             _write_scalars(lanes, s, N_SCALARS, fit)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _lanes_for(heights, frames, n_poses, n_joints, size):
     """Lanes for n_poses candidates of each of the frames.
 
@@ -347,7 +347,7 @@ def _lanes_for(heights, frames, n_poses, n_joints, size):
     )
 
 
-@njit(cache=True)
+@kernel()
 def choose_survivors(rotations, scores, chosen):
     """Choose the candidates to keep after the base joint.
 
@@ -382,7 +382,7 @@ def choose_survivors(rotations, scores, chosen):
         chosen[keep - 1] = order[opposite]
 
 
-@njit(cache=True)
+@inner_kernel()
 def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, batch, candidates, values):
     """All regression rounds of one joint, the j-th solved one, for n lanes."""
     rotations = candidates.rotations
@@ -417,7 +417,7 @@ def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, batch, candidates
             )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _estimate_block(
     batch, frames, tree, regressors, pruner, metric, tuning, body, starts, poses, scores
 ):
@@ -471,7 +471,7 @@ def _estimate_block(
         scores[lanes.frame[s], lanes.pose[s]] = values[s, 0]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def estimate_all(
     batch,
     frames,

@@ -15,7 +15,6 @@ or the upright camera frame of the paper's variant.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from liex_lab.forests._kernels import (
     COLUMN_SLOPE,
@@ -25,6 +24,7 @@ from liex_lab.forests._kernels import (
     VIEW_ROW,
 )
 from liex_lab.geometry._kernels import exp_so3
+from liex_lab.runtime.kernels import kernel
 from liex_lab.scene._blob_kernels import unpack_moments
 from liex_lab.scene._height_map_kernels import crop_camera, to_camera, to_pixel
 
@@ -34,7 +34,7 @@ _LOG_UNIT = 500.0
 _MM_UNIT = 16.0
 
 
-@njit(cache=True)
+@kernel()
 def fill_view(rotation, position, packed_camera, size, reach, view):
     """Linearise the projection of a joint's frame into a height map.
 
@@ -64,7 +64,7 @@ def fill_view(rotation, position, packed_camera, size, reach, view):
     view[VIEW_HEIGHT] = 16.0 * position[2] / size
 
 
-@njit(cache=True)
+@kernel()
 def fill_scalars(rotation, position, scale, moments, size, scalars):
     """Numbers that describe the whole animal relative to a joint, at home size.
 
@@ -107,7 +107,7 @@ def fill_scalars(rotation, position, scale, moments, size, scalars):
     scalars[10] = _LOG_UNIT * np.log(scale / size)
 
 
-@njit(cache=True)
+@kernel()
 def turn(rotation, wx, wy, wz):
     """Rotate a frame about its own axes: rotation <- rotation exp(w), for corrections are local.
 
@@ -127,7 +127,7 @@ def turn(rotation, wx, wy, wz):
             rotation[i, k] = a * step[0, k] + b * step[1, k] + c * step[2, k]
 
 
-@njit(cache=True)
+@kernel()
 def correct_base(rotation, position, scale, twist, size):
     """Move the base by a twist: g <- g exp(twist) (Lie-X Eq. 10, with A of Eq. 5).
 
@@ -168,7 +168,7 @@ def correct_base(rotation, position, scale, twist, size):
     return scale * np.exp(twist[6])
 
 
-@njit(cache=True)
+@kernel()
 def correct_joint(rotation, axes, values, lever):
     """Rotate a joint about its free axes: g <- g exp(r) (Lie-X Eq. 10).
 
@@ -187,7 +187,7 @@ def correct_joint(rotation, axes, values, lever):
     turn(rotation, w[0], w[1], w[2])
 
 
-@njit(cache=True)
+@kernel()
 def place_joint(j, tree, scale, rotations, positions):
     """Place a joint relative to its parent, at its home angle.
 
@@ -211,7 +211,7 @@ def place_joint(j, tree, scale, rotations, positions):
             rotations[j, i, k] = value
 
 
-@njit(cache=True)
+@kernel()
 def place_rest(solved, tree, scale, rotations, positions):
     """Place every joint without a regressor relative to its parent.
 
@@ -230,7 +230,7 @@ def place_rest(solved, tree, scale, rotations, positions):
             place_joint(j, tree, scale, rotations, positions)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def place_all(j, tree, scale, rotations, positions, start, stop):
     """`place_joint` for a batch of candidates.
 
@@ -247,7 +247,7 @@ def place_all(j, tree, scale, rotations, positions, start, stop):
         place_joint(j, tree, scale[s], rotations[s], positions[s])
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def all_features(
     joints,
     crop_cameras,
@@ -302,7 +302,7 @@ def all_features(
             )
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def correct_base_all(rotations, positions, scale, values, levers, size, start, stop):
     """`correct_base` for a batch of candidates.
 
@@ -326,7 +326,7 @@ def correct_base_all(rotations, positions, scale, values, levers, size, start, s
         scale[s] = correct_base(rotations[s, 0], positions[s, 0], scale[s], twist, size[s])
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def correct_joint_all(j, rotations, axes, values, lever, start, stop):
     """`correct_joint` of one joint for a batch of candidates.
 
@@ -352,7 +352,7 @@ _STEP = 0.5  # crop pixels
 _END_SHARE = 0.15
 
 
-@njit(cache=True)
+@kernel()
 def back_over(heights, packed_camera, position, most, out):
     """Height of the animal's back over a joint.
 
@@ -391,7 +391,7 @@ def back_over(heights, packed_camera, position, most, out):
     out[0] = total / many
 
 
-@njit(cache=True)
+@kernel()
 def end_past(heights, packed_camera, end, before, reach):
     """Distance by which the animal extends past the end of a chain, straight on from the joint
     before it.
@@ -431,7 +431,7 @@ def end_past(heights, packed_camera, end, before, reach):
     return reach
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def back_profiles(heights, crop_cameras, positions, length, most_share, out, start, stop):
     """Profile of each chain: the back's height over all joints, and the extent past both ends.
 
@@ -464,7 +464,7 @@ def back_profiles(heights, crop_cameras, positions, length, most_share, out, sta
 # Numba kernel of the head-tail classifier: resamples a height map along an animal's direction.
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out, start, stop):
     """Resample height maps on a grid aligned with the animals.
 
@@ -506,7 +506,7 @@ def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out
 # Numba kernel of the mean cross-sections: a height map read across the mid-axis of a chain.
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def read_across(heights, crop_cameras, points, sideways, lateral, seen, height, start, stop):
     """Read height maps at distances to the left and right of points on the mid-axis.
 

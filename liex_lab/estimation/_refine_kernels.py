@@ -12,10 +12,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
 from liex_lab.geometry._kernels import cholesky, exp_so3, substitute
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.scene._height_map_kernels import crop_camera, to_pixel, to_point
 
 _STRIDE = 4  # every so many crop pixels a reading pulls
@@ -72,7 +72,7 @@ class ResidualWeights(NamedTuple):
     bend: float
 
 
-@njit(cache=True)
+@kernel()
 def nearest_reading(heights, r, c, known):
     """Find the pixel on the animal that is nearest to a crop pixel outside it.
 
@@ -106,7 +106,7 @@ def nearest_reading(heights, r, c, known):
         reach += 1
 
 
-@njit(cache=True)
+@inner_kernel()
 def point_of(heights, packed_camera, r, c, out):
     """The point (3,) mm of the view frame of crop pixel (r, c), into `out`."""
     h = heights[r, c] / 16.0
@@ -114,7 +114,7 @@ def point_of(heights, packed_camera, r, c, out):
     out[2] = h
 
 
-@njit(cache=True)
+@kernel()
 def crop_pixel(packed_camera, p):
     """Row and column (rounded) of a point (3,) mm of the view frame in the crop."""
     u, v = to_pixel(crop_camera(packed_camera), p[0], p[1], p[2])
@@ -123,7 +123,7 @@ def crop_pixel(packed_camera, p):
     return row, column
 
 
-@njit(cache=True)
+@kernel()
 def forward(tree, root_rotation, root_position, angles, scale, rotations, positions):
     """Forward kinematics of one pose, as `body.kinematics.forward_kinematics`.
 
@@ -162,7 +162,7 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
                 rotations[j, i, k] = value
 
 
-@njit(cache=True)
+@kernel()
 def turning_axes(free, angles, rotations, axes):
     """Rotation axes of the free angles in the view frame: R J_r(w) e.
 
@@ -204,7 +204,7 @@ def turning_axes(free, angles, rotations, axes):
             )
 
 
-@njit(cache=True)
+@kernel()
 def ball_slope(b, ball, body, tree, free_angles, axes, rotations, positions, scale, slope):
     """Jacobian of a sphere's centre by base twist, log scale and free angles.
 
@@ -280,7 +280,7 @@ def ball_slope(b, ball, body, tree, free_angles, axes, rotations, positions, sca
                 slope[2, _ROOT + f] += share * (ax * y - ay * x)
 
 
-@njit(cache=True)
+@kernel()
 def _add(row, residual, weight, gradient, curvature):
     """Add one residual to the normal equations (lower half of the curvature)."""
     n = row.size
@@ -293,7 +293,7 @@ def _add(row, residual, weight, gradient, curvature):
             curvature[i, k] += wi * row[k]
 
 
-@njit(cache=True)
+@kernel()
 def _solve(curvature, gradient, step):
     """Solve the positive definite system by Cholesky decomposition, given its lower half.
 
@@ -307,7 +307,7 @@ def _solve(curvature, gradient, step):
     return definite
 
 
-@njit(cache=True)
+@inner_kernel()
 def _pull(points, balls, radius, slopes, robust, gradient, curvature):
     """Residuals of readings (n, 3) mm: distance from the surface of the nearest sphere.
 
@@ -331,7 +331,7 @@ def _pull(points, balls, radius, slopes, robust, gradient, curvature):
         _add(row, best, weight, gradient, curvature)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _push(
     heights, packed_camera, known, balls, radius, slopes, robust, beside, gradient, curvature
 ):
@@ -367,7 +367,7 @@ def _push(
             _add(row, off, weight, gradient, curvature)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _add_prior(tree, weights, moved, growth, turned, gradient, curvature):
     """Residuals of the prior: the distance from the start.
 
@@ -387,7 +387,7 @@ def _add_prior(tree, weights, moved, growth, turned, gradient, curvature):
         curvature[_ROOT + f, _ROOT + f] += weights.bend
 
 
-@njit(cache=True)
+@inner_kernel()
 def _go(step, tree, limits, root_rotation, root_position, angles, scale):
     """Take a step (P,) in place, angles and scale limited; returns the new scale."""
     turn = np.empty((3, 3))
@@ -407,7 +407,7 @@ def _go(step, tree, limits, root_rotation, root_position, angles, scale):
     return scale * np.exp(min(max(step[6], -_MOST_GROWTH), _MOST_GROWTH))
 
 
-@njit(cache=True)
+@inner_kernel()
 def _readings(heights, packed_camera):
     """The points (n, 3) mm of the view frame of every `_STRIDE`-th crop pixel."""
     side = heights.shape[0]
@@ -421,7 +421,7 @@ def _readings(heights, packed_camera):
     return points[:n]
 
 
-@njit(cache=True)
+@inner_kernel()
 def refine_one(
     heights,
     packed_camera,
@@ -494,7 +494,7 @@ def refine_one(
     return scale
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def refine_all(
     heights,
     crop_cameras,

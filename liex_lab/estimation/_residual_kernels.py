@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.scene._blob_kernels import ANGLE
 from liex_lab.scene._height_map_kernels import crop_camera, to_pixel, to_point
 
@@ -57,7 +57,7 @@ class SphereModel(NamedTuple):
     radius: Any
 
 
-@njit(cache=True)
+@kernel()
 def place_balls(rotations, positions, scale, body, out):
     """Centres of the spheres of one pose.
 
@@ -81,7 +81,7 @@ def place_balls(rotations, positions, scale, body, out):
             out[b, i] = first + share * (second - first)
 
 
-@njit(cache=True, fastmath={"nnan", "nsz"})
+@inner_kernel(fastmath={"nnan", "nsz"})
 def nearest_ball(x, y, z, balls, radius, gaps):
     """Signed distance of a point from the surface of the nearest sphere.
 
@@ -112,7 +112,7 @@ def nearest_ball(x, y, z, balls, radius, gaps):
     return best, which
 
 
-@njit(cache=True)
+@inner_kernel()
 def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
     """Residuals of spheres against a height map.
 
@@ -183,7 +183,7 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
     out[WITHIN] = MM_UNIT * within / many
 
 
-@njit(cache=True)
+@inner_kernel()
 def explain_pose(heights, packed_camera, axis, rotations, positions, scale, size, body, out):
     """Residuals of one pose against a height map, see `explain`.
 
@@ -209,7 +209,7 @@ def explain_pose(heights, packed_camera, axis, rotations, positions, scale, size
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def explain_all(
     heights, crop_cameras, moments, image, rotations, positions, scale, size, body, out, start, stop
 ):

@@ -25,7 +25,8 @@ frame) to crop pixels, and the joint's own height.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 TWO_PROBES = 0
 ONE_PROBE = 1
@@ -39,7 +40,7 @@ ROW_SLOPE = 5
 VIEW_HEIGHT = 8
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def probe(heights, view, a, b, c):
     """Read the height map under an offset from a joint.
 
@@ -76,13 +77,13 @@ def probe(heights, view, a, b, c):
     return heights[row, column]
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def byte(word, index):
     """Signed byte `index` (0 is the lowest) of the int32 `word`."""
     return (((word >> (8 * index)) & 0xFF) ^ 0x80) - 0x80
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def response(heights, inverse_size, views, scalars, word0, word1, word3):
     """Response of one sample to a test: the number that is compared with the threshold.
 
@@ -111,7 +112,7 @@ def response(heights, inverse_size, views, scalars, word0, word1, word3):
     )
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def descend(nodes, root, heights, inverse_size, views, scalars):
     """Descend one tree with one sample.
 
@@ -137,7 +138,7 @@ def descend(nodes, root, heights, inverse_size, views, scalars):
     return -child - 1
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def pack_offsets(u, v, threshold):
     """Pack two offsets and a threshold into words 0 and 1 of a node.
 
@@ -163,7 +164,7 @@ def pack_offsets(u, v, threshold):
     return np.int32(word0), np.int32(word1)
 
 
-@njit(cache=True, inline="always")
+@inner_kernel(inline="always")
 def next_random(state):
     """The next 64 random bits of a splitmix64 sequence; `state` (1,) uint64 is advanced."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
@@ -173,13 +174,13 @@ def next_random(state):
     return z ^ (z >> np.uint64(31))
 
 
-@njit(cache=True, inline="always")
+@inner_kernel(inline="always")
 def random_below(state, n):
     """A random integer of 0 .. n - 1 from the splitmix64 sequence `state` (1,)."""
     return np.int64((next_random(state) >> np.uint64(33)) % np.uint64(n))
 
 
-@njit(cache=True)
+@kernel()
 def number_nodes(is_leaf, starts, nodes):
     """Write the child pointers of trees into word 2 of their nodes, in the order of their growth.
 

@@ -17,10 +17,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, VIEW, descend
+from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.shapes import check_index, check_shapes
 from liex_lab.runtime.threads import in_parallel
 
@@ -311,7 +311,7 @@ def predict_each(forest: Forest, samples: Samples) -> NDArray[np.float32]:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _predict_each(
     nodes, roots, leaves, heights, image, inverse_size, views, scalars, out, start, stop
 ):
@@ -323,7 +323,7 @@ def _predict_each(
             out[s, t] = leaves[leaf]
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _predict(
     nodes, roots, leaves, heights, image, inverse_size, views, scalars, in_bag, out, start, stop
 ):

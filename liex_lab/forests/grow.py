@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from liex_lab.forests._kernels import (
@@ -30,6 +30,7 @@ from liex_lab.forests._kernels import (
     response,
 )
 from liex_lab.forests.forest import Forest, Samples, predict
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.runtime.shapes import check_shapes
 
 _N_THRESHOLDS = 20
@@ -210,7 +211,7 @@ def boost_forest(
     return Forest.join(trees)
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _grow_all(samples, growth, order, starts, seeds, nodes, leaves, counts):
     """Grow all trees in parallel: tree t on the samples order[starts[t] : starts[t + 1]]."""
     for t in prange(seeds.size):
@@ -225,7 +226,7 @@ def _grow_all(samples, growth, order, starts, seeds, nodes, leaves, counts):
         )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _draw_test(state, n_views, n_scalars, growth, test):
     """A random test into `test` (3,) int32: words 0, 1 and 3 of a node, threshold still 0."""
     kind_draw = (next_random(state) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
@@ -247,7 +248,7 @@ def _draw_test(state, n_views, n_scalars, growth, test):
     test[2] = kind + 4 * channel
 
 
-@njit(cache=True)
+@inner_kernel()
 def _best_threshold(values, n, labels, min_share, sums, result):
     """Best of evenly spread thresholds for the responses of a node's samples: gain and threshold.
 
@@ -308,7 +309,7 @@ def _best_threshold(values, n, labels, min_share, sums, result):
             result[1] = low + (b + 0.5) / scale
 
 
-@njit(cache=True)
+@inner_kernel()
 def _response(samples, s, test):
     """The response of sample s to a test, words 0, 1 and 3 of a node."""
     return response(
@@ -322,7 +323,7 @@ def _response(samples, s, test):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _respond(samples, n, tests, scratch, values):
     """Responses (tests, n) and labels of the first n of the chosen samples, sample by sample.
 
@@ -343,7 +344,7 @@ def _respond(samples, n, tests, scratch, values):
             )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _find_split(samples, growth, members, state, scratch, best):
     """Find the test of a node.
 
@@ -403,7 +404,7 @@ def _find_split(samples, growth, members, state, scratch, best):
     return found
 
 
-@njit(cache=True)
+@kernel()
 def _keep(test, threshold, best):
     """Write a test (3,) and its threshold into `best` (4,), in the layout of a node."""
     best[0] = test[0]
@@ -412,7 +413,7 @@ def _keep(test, threshold, best):
     best[3] = min(max(int(np.ceil(threshold)), -32768), 32767)
 
 
-@njit(cache=True)
+@kernel()
 def _part(samples, members, best):
     """Partition `members` in place so that those that go left are first; returns their number."""
     left = 0
@@ -426,7 +427,7 @@ def _part(samples, members, best):
     return left
 
 
-@njit(cache=True)
+@inner_kernel()
 def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
     """Grow one tree on the samples `members` into nodes and leaves, depth first.
 

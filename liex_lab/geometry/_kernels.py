@@ -8,10 +8,11 @@ Matrices this small (at most some dozen rows) do not justify a LAPACK call.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 
-@njit(cache=True)
+@inner_kernel()
 def cholesky(a, factor, least):
     """Cholesky's factor of a symmetric matrix, of which only the lower half is read.
 
@@ -37,7 +38,7 @@ def cholesky(a, factor, least):
     return definite
 
 
-@njit(cache=True)
+@inner_kernel()
 def substitute(factor, x):
     """Solve L L^T x = b.
 
@@ -61,7 +62,7 @@ def substitute(factor, x):
 # Kernels of the rotation group SO(3): Rodrigues' exponential and the logarithm by a quaternion.
 
 
-@njit(cache=True)
+@kernel()
 def exp_so3(wx, wy, wz, out):
     """Rotation matrix of a rotation vector (Rodrigues), the scalar twin of `geometry.so3.exp`.
 
@@ -90,7 +91,7 @@ def exp_so3(wx, wy, wz, out):
     out[2, 2] = 1.0 - b * (wx * wx + wy * wy)
 
 
-@njit(cache=True)
+@kernel()
 def log_so3(r, out):
     """Logarithm of SO(3), through the quaternion's largest component, so that it is exact up to π.
 

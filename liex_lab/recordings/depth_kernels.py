@@ -24,8 +24,9 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from liex_lab.runtime.kernels import kernel
 
 UNREAD = np.float32(1e30)  # marks a pixel without a reading; any reading overrides it
 _ONE = np.float32(1.0)
@@ -36,7 +37,7 @@ _FOUR = np.float32(4.0)
 _FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def look_up(depth, source, out):
     """For every pixel of the rectified image, copy the depth of one pixel of the original image.
 
@@ -52,7 +53,7 @@ def look_up(depth, source, out):
             out[row, column] = stored[k] if k >= 0 else np.float32(0.0)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@kernel(nogil=True, fastmath=_FAST)
 def lift_row(depth, law, u, v, deep):
     """Pixels and depths of the readings of one row after correction for refraction.
 
@@ -85,7 +86,7 @@ def lift_row(depth, law, u, v, deep):
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def lift(depth, laws, out):
     """Splat every pixel of a depth image to its corrected position; the nearest reading wins.
 
@@ -118,7 +119,7 @@ def lift(depth, laws, out):
                 out[i, j] = z
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def close(lifted, out):
     """Fill holes between two readings, side by side or one above the other, with the farther one.
 
@@ -143,7 +144,7 @@ def close(lifted, out):
             out[row, column] = z
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _between(one, other):
     """The farther of two readings, mm; 0 unless both are readings."""
     return max(one, other) if one < UNREAD and other < UNREAD else np.float32(0.0)
@@ -152,7 +153,7 @@ def _between(one, other):
 # RVL, lossless run-length and variable-length code for 16-bit depth (Wilson, ISS 2017).
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _put(
     value: int, words: NDArray[np.uint32], word: np.uint32, at: int, held: int
 ) -> tuple[np.uint32, int, int]:
@@ -177,7 +178,7 @@ def _put(
             return word, at, held
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _pack(pixels: NDArray[np.uint16], words: NDArray[np.uint32]) -> int:
     """Encode pixels (n,) into words (at least n + 2) and return the number of words used."""
     n = len(pixels)
@@ -238,7 +239,7 @@ def rvl_message(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return np.concatenate([np.frombuffer(head, np.uint8), pack_rvl(depth).view(np.uint8)])
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _take(
     words: NDArray[np.uint32], word: np.uint32, at: int, held: int
 ) -> tuple[int, np.uint32, int, int]:
@@ -262,7 +263,7 @@ def _take(
     return -1, word, at, held
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _unpack(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
     """Decode words into pixels (n,), which must be zero; False if the words do not match n."""
     n = len(pixels)
@@ -305,7 +306,7 @@ def unpack_rvl(data: bytes | memoryview, width: int, height: int) -> NDArray[np.
     return pixels.reshape(height, width) if _unpack(words, pixels) else None
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _to_millimetres(depth: NDArray[np.float32], out: NDArray[np.uint16]) -> None:
     for row in range(depth.shape[0]):
         for column in range(depth.shape[1]):
@@ -335,7 +336,7 @@ _RUN = 0xE0
 _WIDE = 0xFF
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _oni_kernels_unpack(stream, table, out):
     """Decode a stream of numbers, and look up the depth of each in a table.
 
@@ -428,7 +429,7 @@ def unpack_16z(
 # LZF decompression (Lehmann's LibLZF), used by PCL for its images: numba kernel.
 
 
-@njit(cache=True)
+@kernel()
 def unpack_lzf(packed, out):
     """Decompress LZF data.
 

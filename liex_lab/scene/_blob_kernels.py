@@ -14,7 +14,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 BLOCK = 4  # pixels per side; blobs are connected in blocks
 # only every other row is read: reading an image takes longer than processing it
@@ -90,13 +91,13 @@ SD_ACROSS = BlobMoments._fields.index("sd_across")
 SLOPE = BlobMoments._fields.index("slope")
 
 
-@njit(cache=True)
+@inner_kernel()
 def unpack_blob(packed):
     """The record of one component's packed counts (N_BLOB,)."""
     return Blob(packed[0], packed[1], packed[2], packed[3], packed[4], packed[5], packed[6])
 
 
-@njit(cache=True)
+@inner_kernel()
 def pack_blob(blob, packed):
     """Write a component's record into its row (N_BLOB,) of the packed counts."""
     packed[0] = blob.n_px
@@ -108,7 +109,7 @@ def pack_blob(blob, packed):
     packed[6] = blob.n_on_floor
 
 
-@njit(cache=True)
+@inner_kernel()
 def unpack_moments(packed):
     """The record of one component's packed moments (N_MOMENTS,)."""
     return BlobMoments(
@@ -124,7 +125,7 @@ def unpack_moments(packed):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
     """Connected components of the pixels nearer than a limit, in blocks.
 
@@ -174,7 +175,7 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
     return n_blobs
 
 
-@njit(cache=True)
+@kernel()
 def layers(depth, limit, labels, slot, blob, apart):
     """The depth that separates a component into a near and a far layer, and the extent of both.
 
@@ -224,7 +225,7 @@ def layers(depth, limit, labels, slot, blob, apart):
     return cut, near, far
 
 
-@njit(cache=True)
+@kernel()
 def forget(labels, slot):
     """Turn the blocks labelled `slot` in labels (h, w) into background, -1."""
     for i in range(labels.shape[0]):
@@ -233,7 +234,7 @@ def forget(labels, slot):
                 labels[i, j] = -1
 
 
-@njit(cache=True)
+@inner_kernel()
 def _is_unread(depth, row, column):
     """Whether most of a block has no reading."""
     n = 0
@@ -243,7 +244,7 @@ def _is_unread(depth, row, column):
     return n >= _MIN_UNREAD
 
 
-@njit(cache=True)
+@inner_kernel()
 def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack):
     """Flood fill: blocks connected with (i, j) get the label `slot`; their counts, a `Blob`."""
     n_px = 0
@@ -291,7 +292,7 @@ def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack):
     return Blob(n_px, first_row, last_row, first_column, last_column, depth_sum, n_on_floor)
 
 
-@njit(cache=True)
+@inner_kernel()
 def is_animal_block(labels, row, column, slot):
     """Whether a block belongs to the component or borders it without belonging to another one.
 
@@ -314,7 +315,7 @@ def is_animal_block(labels, row, column, slot):
     return False
 
 
-@njit(cache=True)
+@inner_kernel()
 def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
     """Heights above a plane of a component's pixels, on a crop.
 
@@ -353,7 +354,7 @@ def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
             raw[r, c] = value
 
 
-@njit(cache=True)
+@inner_kernel()
 def find_root(parent, k):
     """The root of k in a union-find forest, with path halving.
 
@@ -367,7 +368,7 @@ def find_root(parent, k):
     return k
 
 
-@njit(cache=True)
+@inner_kernel()
 def keep_largest(raw, runs):
     """Erase all pixels of a crop except the largest group, in which no gap is wider than a pixel.
 
@@ -422,7 +423,7 @@ def keep_largest(raw, runs):
                 raw[runs[k, 0], c] = -1.0
 
 
-@njit(cache=True)
+@kernel()
 def level_heights(raw, behind_mm):
     """Shift all heights so that their mean becomes behind_mm, and erase those not above 0.
 
@@ -457,7 +458,7 @@ def level_heights(raw, behind_mm):
     return lift
 
 
-@njit(cache=True)
+@inner_kernel()
 def smooth_heights(raw, radius, out):
     """Box-filtered heights, with holes filled from their surroundings.
 
@@ -513,7 +514,7 @@ def smooth_heights(raw, radius, out):
                 out[r, c] = min(32000, int(mean * 16.0 + 0.5))
 
 
-@njit(cache=True)
+@inner_kernel()
 def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, moments):
     """Mass, area and principal axes of an animal from its height map, in the view frame.
 
@@ -584,7 +585,7 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     moments[SD_ACROSS] = np.sqrt(max(half - root, 0.0))
 
 
-@njit(cache=True)
+@inner_kernel()
 def back_slope(heights, origin, step, intrinsics, distance, moments):
     """Slope of the back along the long axis, in a height map cut along the optical axis.
 

@@ -18,8 +18,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.scene import _blob_kernels as blob_kernels
 from liex_lab.scene._blob_kernels import BLOCK, find_root
 
@@ -60,7 +60,7 @@ class SurfaceBlocks(NamedTuple):
     points: Any
 
 
-@njit(cache=True)
+@inner_kernel()
 def block_depths(depth, near, far, blocks):
     """The nearest depth in every block.
 
@@ -97,7 +97,7 @@ def block_depths(depth, near, far, blocks):
             blocks[i, j] = total / n if n >= _MIN_IN_BLOCK else 0.0
 
 
-@njit(cache=True)
+@kernel()
 def label_surfaces(blocks, labels, focal2, least_mm2, areas):
     """Connected surfaces: flood fill over blocks whose depths differ by less than 50 mm.
 
@@ -158,7 +158,7 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
     return n_surfaces
 
 
-@njit(cache=True)
+@kernel()
 def list_surfaces(blocks, labels, n_surfaces, intrinsics):
     """The blocks of all surfaces.
 
@@ -201,7 +201,7 @@ def list_surfaces(blocks, labels, n_surfaces, intrinsics):
     ]
 
 
-@njit(cache=True)
+@kernel()
 def walk(blocks, labels, surface, position, order, hops):
     """All blocks of a surface by geodesic distance from where it leaves the image.
 
@@ -255,7 +255,7 @@ def walk(blocks, labels, surface, position, order, hops):
     return _spread(blocks, labels, surface.slot, n, position, order, hops)
 
 
-@njit(cache=True)
+@inner_kernel()
 def walk_from(blocks, labels, slot, i, j, position, order, hops):
     """`walk` from one block of the surface.
 
@@ -279,7 +279,7 @@ def walk_from(blocks, labels, slot, i, j, position, order, hops):
     return _spread(blocks, labels, slot, 1, position, order, hops)
 
 
-@njit(cache=True)
+@kernel()
 def _spread(blocks, labels, slot, n, position, order, hops):
     """Breadth-first search from the first n blocks; returns the final number of blocks."""
     at = 0
@@ -300,7 +300,7 @@ def _spread(blocks, labels, slot, n, position, order, hops):
     return n
 
 
-@njit(cache=True)
+@kernel()
 def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
     """The geodesic extrema of a traversed surface whose persistence is at least `least_mm`.
 
@@ -356,7 +356,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
     )
 
 
-@njit(cache=True)
+@kernel()
 def _note(tips, n_tips, z, out, block):
     """Add an extremum at depth z mm whose persistence is `out` times the required one."""
     if n_tips == MAX_TIPS:
@@ -368,7 +368,7 @@ def _note(tips, n_tips, z, out, block):
     return n_tips + 1
 
 
-@njit(cache=True)
+@inner_kernel()
 def nearest_ends(blocks, labels, surfaces, size, intrinsics, chosen):
     """Candidate positions of a hand, nearest first and distinct.
 
@@ -428,7 +428,7 @@ def nearest_ends(blocks, labels, surfaces, size, intrinsics, chosen):
     return n_chosen
 
 
-@njit(cache=True)
+@inner_kernel()
 def point_of_block(blocks, i, j, intrinsics):
     """The point of a block's centre at its depth.
 
@@ -447,7 +447,7 @@ def point_of_block(blocks, i, j, intrinsics):
     return x, y, z
 
 
-@njit(cache=True)
+@inner_kernel()
 def relabel(labels, surface):
     """Restore the label of all blocks of a surface.
 

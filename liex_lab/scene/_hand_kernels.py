@@ -13,8 +13,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.scene import _blob_kernels as blob_kernels
 from liex_lab.scene._blob_kernels import BLOCK
 from liex_lab.scene._geodesic_kernels import (
@@ -61,7 +61,7 @@ class HandFind(NamedTuple):
     area_mm2: Any
 
 
-@njit(cache=True)
+@inner_kernel()
 def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
     """Mean depth of the blocks labelled `mark`, and how unlike a hand they are.
 
@@ -113,13 +113,13 @@ def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
     )
 
 
-@njit(cache=True)
+@kernel()
 def _side(depth, focal):
     """The side of a block at this depth, mm."""
     return BLOCK * depth / focal
 
 
-@njit(cache=True)
+@inner_kernel()
 def _behind_cut(point, found, size):
     """Whether a point (3,) lies close behind the cut through the arm."""
     x = point[0]
@@ -181,7 +181,7 @@ class HandSight(NamedTuple):
     along_axis: Any
 
 
-@njit(cache=True)
+@inner_kernel()
 def locate(blocks, labels, surface, tip, size, intrinsics):
     """Locate the hand at an extremum of a surface; its blocks get the label MAX_SURFACES.
 
@@ -221,7 +221,7 @@ def locate(blocks, labels, surface, tip, size, intrinsics):
     return HandFind(middle, fingers, cut + base, area)
 
 
-@njit(cache=True)
+@kernel()
 def _within(surface, radius, middle, near):
     """Copy the points of a surface within `radius` mm of the middle into rows of x, y, z, distance,
     block row, block column; returns their number.
@@ -244,7 +244,7 @@ def _within(surface, radius, middle, near):
     return n
 
 
-@njit(cache=True)
+@inner_kernel()
 def _away_from_arm(points, size, focal2, middle, fingers):
     """The direction (3,) from the arm to the middle of the hand; False, and zeros, if no arm leaves
     the sphere.
@@ -266,7 +266,7 @@ def _away_from_arm(points, size, focal2, middle, fingers):
     return has_arm
 
 
-@njit(cache=True)
+@inner_kernel()
 def _wrist(points, size, focal2, middle, fingers):
     """Position of the cut through the arm along `fingers` (3,) from the middle, mm: a hand's length
     behind the fingertips.
@@ -286,7 +286,7 @@ def _wrist(points, size, focal2, middle, fingers):
     return b * _BIN_MM - around - _LENGTH_MM * size
 
 
-@njit(cache=True)
+@kernel()
 def _beyond(points, middle, fingers, cut, labels, mark):
     """Move `middle` (3,) to the middle of the blocks beyond the cut, optionally marked in labels;
     returns the sum of z^2.
@@ -311,7 +311,7 @@ def _beyond(points, middle, fingers, cut, labels, mark):
     return total
 
 
-@njit(cache=True)
+@kernel()
 def _along(p, middle, fingers):
     """Distance of p (3,) from `middle` along `fingers`."""
     return (
@@ -321,7 +321,7 @@ def _along(p, middle, fingers):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def compare_ends(blocks, labels, surfaces, ends, size, intrinsics, unlike):
     """How unlike a hand the segmentation at each extremum is.
 
@@ -349,7 +349,7 @@ def compare_ends(blocks, labels, surfaces, ends, size, intrinsics, unlike):
         unlike[k] += _PER_MM_BEHIND * min(depth[k] - nearest, _MOST_BEHIND_MM)
 
 
-@njit(cache=True)
+@inner_kernel()
 def box_of(labels, surface, mark, box):
     """The bounding box of the blocks of a surface that are labelled `mark`.
 
@@ -372,7 +372,7 @@ def box_of(labels, surface, mark, box):
             box[2], box[3] = min(box[2], j), max(box[3], j)
 
 
-@njit(cache=True)
+@kernel()
 def sight_rotation(x, y, rotation):
     """Rotation of T_view_camera for a line of sight (x, y, 1): z points at the camera along it.
 
@@ -397,7 +397,7 @@ def sight_rotation(x, y, rotation):
     rotation[1, 2] = up[0] * rotation[0, 1] - up[1] * rotation[0, 0]
 
 
-@njit(cache=True)
+@inner_kernel()
 def cut_heights(
     depth, blocks, labels, found, plane, distance, intrinsics, origin, step, near, far, raw
 ):
@@ -454,7 +454,7 @@ def cut_heights(
                 raw[r, c] = above
 
 
-@njit(cache=True)
+@inner_kernel()
 def _reach(blocks, labels, row, column):
     """Largest depth of a pixel of the hand in this block, mm; 0 if no block near it belongs to the
     hand.
@@ -467,7 +467,7 @@ def _reach(blocks, labels, row, column):
     return farthest + np.float32(_RIM_MM) if farthest > 0 else farthest
 
 
-@njit(cache=True)
+@inner_kernel()
 def extract_one(depth, n_candidates, sight, crops, k):
     """Find the hand in one frame and fill its row of the batch; see `HandSegmenter.extract`.
 
@@ -507,7 +507,7 @@ def extract_one(depth, n_candidates, sight, crops, k):
             cut_end(depth, blocks, labels, surface, end, sight, crops, k)
 
 
-@njit(cache=True)
+@inner_kernel()
 def cut_end(depth, blocks, labels, surface, end, sight, crops, k):
     """The height map of the hand at an extremum, and its moments; labels are preserved.
 
@@ -577,7 +577,7 @@ def cut_end(depth, blocks, labels, surface, end, sight, crops, k):
     crops.n_px[k] = int(moments[blob_kernels.N_PX])
 
 
-@njit(cache=True)
+@inner_kernel()
 def view_axis(origin, step, crop, intrinsics, along_axis):
     """Direction of the view's axis: through the middle of the crop, or the optical axis.
 
@@ -599,7 +599,7 @@ def view_axis(origin, step, crop, intrinsics, along_axis):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def view_plane(rotation, distance, intrinsics):
     """Coefficients (3,) a, b, c of a view's reference plane: 1 / z = a u + b v + c.
 
@@ -613,7 +613,7 @@ def view_plane(rotation, distance, intrinsics):
     return np.array([a, b, -rotation[2, 2] / distance - a * intrinsics[2] - b * intrinsics[3]])
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def extract_all(depths, n_candidates, sights, crops, start, stop):
     """Find the hand in every image and fill the batch.
 
@@ -639,7 +639,7 @@ def extract_all(depths, n_candidates, sights, crops, start, stop):
         extract_one(depths[k], n_candidates, sight, crops, k)
 
 
-@njit(cache=True)
+@kernel()
 def fill_rotations(intrinsics, origin, step, crop, along_axis, rotations):
     """Rotations of T_view_camera along the lines of sight through the middles of crops.
 

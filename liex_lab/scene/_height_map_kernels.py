@@ -12,8 +12,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.scene import _blob_kernels as blob_kernels
 
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
@@ -44,7 +44,7 @@ class Sight(NamedTuple):
     smooth_mm: Any
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas, start, stop):
     """Areas of the connected components of every frame; 0 for one that does not stand on the floor.
 
@@ -71,7 +71,7 @@ def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas, start, stop):
                 areas[k, slot] = blob_area(blob, mm2_per_px)
 
 
-@njit(cache=True)
+@inner_kernel()
 def blob_area(blob, mm2_per_px):
     """Area mm^2, seen from the camera, of a component at its mean depth.
 
@@ -82,7 +82,7 @@ def blob_area(blob, mm2_per_px):
     return blob.n_px * (blob.depth_sum / blob.n_px) ** 2 * mm2_per_px
 
 
-@njit(cache=True)
+@kernel()
 def order_blobs(blobs, n_blobs, area, mm2_per_px):
     """Order the components by similarity of their areas to the animal's, and count the similar
     ones.
@@ -121,7 +121,7 @@ def order_blobs(blobs, n_blobs, area, mm2_per_px):
     return order, n_near
 
 
-@njit(cache=True)
+@kernel()
 def parted(depth, limit, labels, blobs, area, mm2_per_px):
     """The image without objects that merely overlap the animal in it, separated by a gap in depth.
 
@@ -163,7 +163,7 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
     return depth, False
 
 
-@njit(cache=True)
+@inner_kernel()
 def _push_back(depth, labels, slot, cut):
     """Turn pixels farther than `cut` mm in a component and at its border into background."""
     for i in range(labels.shape[0]):
@@ -175,7 +175,7 @@ def _push_back(depth, labels, slot, cut):
                             depth[v, u] = _FAR
 
 
-@njit(cache=True)
+@inner_kernel()
 def extract_one(depth, limit, on_floor, area, n_candidates, parts, sight, crops, k):
     """Find the animal in one frame and fill its row of the batch.
 
@@ -216,7 +216,7 @@ def extract_one(depth, limit, on_floor, area, n_candidates, parts, sight, crops,
             crops.n_px[row] = int(blob.n_px)
 
 
-@njit(cache=True)
+@inner_kernel()
 def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
     """The smoothed height map of one component, and its moments, into row k of the batch.
 
@@ -274,7 +274,7 @@ def cut_crop(depth, limit, labels, slot, blob, sight, crops, k):
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def extract_all(depths, limit, on_floor, area, n_candidates, parts, sight, crops, start, stop):
     """Find the animal in every frame of one camera and fill the batch.
 
@@ -294,7 +294,7 @@ def extract_all(depths, limit, on_floor, area, n_candidates, parts, sight, crops
         extract_one(depths[k], limit, on_floor, area, n_candidates, parts, sight, crops, k)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def extract_windows(depths, background, margin, area, n_candidates, sights, crops, start, stop):
     """Find the animal in image patches from many cameras and fill the batch.
 
@@ -404,7 +404,7 @@ class CropRows(NamedTuple):
     n_blobs: Any
 
 
-@njit(cache=True)
+@inner_kernel()
 def crop_camera(packed):
     """The record of one packed crop camera (17,)."""
     return CropCamera(
@@ -428,7 +428,7 @@ def crop_camera(packed):
     )
 
 
-@njit(cache=True)
+@kernel()
 def to_camera(camera, x0, y0, z0):
     """x, y, z mm in the camera frame of a point of the view frame; z is at least 1 mm."""
     z0 -= camera.distance
@@ -438,7 +438,7 @@ def to_camera(camera, x0, y0, z0):
     return x, y, z
 
 
-@njit(cache=True)
+@kernel()
 def to_pixel(camera, x0, y0, z0):
     """Column and row of the crop, not rounded, of a point mm of the view frame."""
     x, y, z = to_camera(camera, x0, y0, z0)
@@ -447,7 +447,7 @@ def to_pixel(camera, x0, y0, z0):
     return column, row
 
 
-@njit(cache=True)
+@inner_kernel()
 def to_point(camera, row, column, height):
     """x, y mm of the view frame of a crop pixel, `height` mm above its plane."""
     dx = (camera.u0 + camera.step * column - camera.cx) / camera.fx
@@ -461,7 +461,7 @@ def to_point(camera, row, column, height):
 # Kernels of the per-pixel background model: the farthest mode of a pixel's sorted readings.
 
 
-@njit(cache=True)
+@inner_kernel()
 def far_mode(values, window):
     """Depth and spread of the farthest cluster in sorted readings; (0, 0) without one.
 
@@ -503,7 +503,7 @@ def far_mode(values, window):
     return 0.0, 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def far_modes(ordered, window_share, window_mm, near_share, depth, spread, near, start, stop):
     """Background depth, its spread and the nearest usual depth of every pixel.
 

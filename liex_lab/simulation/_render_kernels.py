@@ -11,9 +11,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from liex_lab.body._rasterizer_kernels import draw
+from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.simulation._sensor_kernels import (
     ANIMAL,
     BACKGROUND,
@@ -112,19 +113,19 @@ class ArenaView(NamedTuple):
     rough: Any
 
 
-@njit(cache=True)
+@inner_kernel()
 def noise_of(noises, i):
     """The `SensorNoise` of image i."""
     return SensorNoise(noises.parameters[i], noises.seed[i], noises.table)
 
 
-@njit(cache=True)
+@inner_kernel()
 def camera_of(cameras, i):
     """The `PatchCamera` of image i."""
     return PatchCamera(cameras.intrinsics[i], cameras.picture[i], cameras.origin[i])
 
 
-@njit(cache=True)
+@inner_kernel()
 def _meshes_of(meshes, i):
     """The `Meshes` of image i."""
     return Meshes(
@@ -136,13 +137,13 @@ def _meshes_of(meshes, i):
     )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _unpack_wall(packed):
     """The record of one packed wall (WALL_COLUMNS,)."""
     return Wall(packed[0], packed[1], packed[2], packed[3], packed[4], packed[5])
 
 
-@njit(cache=True)
+@inner_kernel()
 def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, rough, depth, what):
     """Ideal depth and kind of a patch (H, W) on a floor with at most one straight wall.
 
@@ -191,7 +192,7 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
             what[r, c] = STILL
 
 
-@njit(cache=True)
+@kernel()
 def merge(inverse, label, top, left, depth, what):
     """Merge a rendered mesh (inverse depth, h, w) at row `top`, column `left`, by z-buffer.
 
@@ -206,7 +207,7 @@ def merge(inverse, label, top, left, depth, what):
                     what[top + r, left + c] = label
 
 
-@njit(cache=True)
+@inner_kernel()
 def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label, depth, what):
     """Rasterise a mesh into an image or patch, within the mesh's bounding box only.
 
@@ -264,7 +265,7 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
     merge(inverse, label, top, left, depth, what)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what):
     """Rasterise the animal and, if present, the object into an image or patch."""
     draw_onto(
@@ -294,7 +295,7 @@ def _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what)
         )
 
 
-@njit(cache=True)
+@inner_kernel()
 def _window(meshes, camera, view, noise, depth_out, background_out):
     """One training patch: still scene, its learned background, animal, optional object, noise."""
     shape = depth_out.shape
@@ -353,7 +354,7 @@ def _window(meshes, camera, view, noise, depth_out, background_out):
     )
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def draw_windows(meshes, cameras, views, noises, depth_out, background_out):
     """Render n training patches and their learned backgrounds, one thread per patch.
 
@@ -377,7 +378,7 @@ def draw_windows(meshes, cameras, views, noises, depth_out, background_out):
         )
 
 
-@njit(cache=True)
+@kernel()
 def frame(still, meshes, rotation, translation, intrinsics, noise, out):
     """Render one full frame: the still scene, the animal, an optional object, and the sensor.
 
@@ -409,7 +410,7 @@ def frame(still, meshes, rotation, translation, intrinsics, noise, out):
     )
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def frames_parallel(still, meshes, rotation, translation, intrinsics, noises, out):
     """Render n full frames of one scene, one thread per frame; see `frame`.
 
@@ -463,13 +464,13 @@ class HandMeshes(NamedTuple):
     has_thing: Any
 
 
-@njit(cache=True)
+@kernel()
 def _put(vertices, faces, intrinsics, u0, v0, label, depth, what):
     """Rasterise a mesh in the camera frame into an image or patch; see `draw_onto`."""
     draw_onto(vertices, faces, np.eye(3), np.zeros(3), intrinsics, u0, v0, label, depth, what)
 
 
-@njit(cache=True)
+@kernel()
 def picture(meshes, wall, camera, noise, out):
     """Render one depth image or patch (H, W) of a hand.
 
@@ -524,7 +525,7 @@ def picture(meshes, wall, camera, noise, out):
     )
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def pictures(meshes, walls, cameras, noises, out):
     """Render n depth images or patches of hands, one thread per image; see `picture`.
 

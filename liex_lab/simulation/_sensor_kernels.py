@@ -16,7 +16,8 @@ indexed as below.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 NOTHING = 0
 STILL = 1
@@ -70,7 +71,7 @@ def _normal_table() -> np.ndarray:
 NORMAL = _normal_table()
 
 
-@njit(cache=True)
+@inner_kernel()
 def advance(state):
     """The next 64 random bits (xorshift64, after Marsaglia); state (1,) must not be 0."""
     x = state[0]
@@ -81,19 +82,19 @@ def advance(state):
     return x
 
 
-@njit(cache=True)
+@kernel()
 def uniform(state):
     """A number in [0, 1) with 24 random bits, advancing state (1,)."""
     return np.float64(advance(state) >> np.uint64(40)) * (1.0 / 16777216.0)
 
 
-@njit(cache=True)
+@kernel()
 def normal(state, table):
     """A standard normal number by inversion, to the resolution of the quantile table (2^13,)."""
     return table[np.int64(advance(state) >> np.uint64(_SHIFT))]
 
 
-@njit(cache=True)
+@inner_kernel()
 def smooth_field(state, table, spacing, out):
     """Value noise: normal numbers at nodes `spacing` pixels apart, interpolated bilinearly.
 
@@ -135,7 +136,7 @@ def smooth_field(state, table, spacing, out):
             out[v, u] = a + t * (b - a)
 
 
-@njit(cache=True)
+@inner_kernel()
 def soften(depth, what, p, state, table, field):
     """Effects of fur before any sensor: lumps, a bias of dark hair, a weaker outline.
 
@@ -176,7 +177,7 @@ def soften(depth, what, p, state, table, field):
             what[lost[i, 0], lost[i, 1]] = STILL
 
 
-@njit(cache=True)
+@kernel()
 def _outside(depth, what, v, u):
     """The farthest of the four neighbours that are not the animal, 0 if all are."""
     far = np.float32(0.0)
@@ -191,7 +192,7 @@ def _outside(depth, what, v, u):
     return far
 
 
-@njit(cache=True)
+@kernel()
 def _step(depth, v, u):
     """Largest signed depth difference to the existing neighbours (up to four), mm."""
     height, width = depth.shape
@@ -208,7 +209,7 @@ def _step(depth, v, u):
     return worst
 
 
-@njit(cache=True)
+@inner_kernel()
 def primesense(depth, what, p, focal, state, table, out):
     """Structured light: disparity f b / z with smooth noise, quantised to eighths of a pixel.
 
@@ -256,7 +257,7 @@ def primesense(depth, what, p, focal, state, table, out):
             out[v, u] = int(fb / disparity + 0.5) if disparity > 0.5 else 0
 
 
-@njit(cache=True)
+@kernel()
 def _shadow(row, fb, side, shadow):
     """Mark pixels of a row of depths (W,) that are hidden from the projector.
 
@@ -275,7 +276,7 @@ def _shadow(row, fb, side, shadow):
             front = min(front, seen)
 
 
-@njit(cache=True)
+@inner_kernel()
 def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
     """Time of flight: range noise by distance, angle and slope, and flying pixels at outlines.
 
@@ -320,7 +321,7 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
             out[v, u] = int(z + 0.5)
 
 
-@njit(cache=True)
+@inner_kernel()
 def light_field(depth, what, p, state, table, out):
     """A plenoptic camera: depth from matched texture, with large and mostly smooth range noise.
 
@@ -381,7 +382,7 @@ def light_field(depth, what, p, state, table, out):
             out[v, u] = int(z * per_step + 0.5) if z > 0.0 else 0
 
 
-@njit(cache=True)
+@kernel()
 def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
     """Apply `soften` and the sensor's model to one image; depth and what are overwritten.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import chain_arc, spine_frame
@@ -19,6 +19,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
+from liex_lab.runtime.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -242,7 +243,7 @@ def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
     return turn @ rise @ so3.exp(np.stack([roll, zero, zero], axis=-1))
 
 
-@njit(cache=True, parallel=True)
+@kernel(parallel=True)
 def _lowest_points(joints, rotations, girth, stations, half_width, half_height, out):
     """Fill out (n, R) with the lowest point of the trunk's ellipse at every station, mm.
 

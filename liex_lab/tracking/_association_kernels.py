@@ -15,7 +15,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
+
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 NONE = -1
 
@@ -74,7 +75,7 @@ class Chains(NamedTuple):
     parent: Any
 
 
-@njit(cache=True)
+@inner_kernel()
 def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
     """Transition cost of moving from joints (J, 3) mm to others in dt s, nats.
 
@@ -112,7 +113,7 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
     return min(costs.tail * np.log1p(cost / costs.tail), most)
 
 
-@njit(cache=True)
+@kernel()
 def extend(t, chains, n_beam, seen, costs):
     """One Viterbi step: add frame t and its hypotheses to the beam; returns the beam's size.
 
@@ -160,7 +161,7 @@ def extend(t, chains, n_beam, seen, costs):
     return _keep_best(t, chains, n_beam, missed_cost)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _keep_best(t, chains, n_beam, missed_cost):
     """Prune: keep the best chains after frame t in the beam, best first; returns their number."""
     beam = chains.beam
@@ -196,7 +197,7 @@ def _keep_best(t, chains, n_beam, missed_cost):
     return kept
 
 
-@njit(cache=True)
+@kernel()
 def extend_all(start, stop, chains, n_beam, seen, costs):
     """Viterbi over frames start to stop: `extend` for each; returns the beam's size.
 
@@ -216,7 +217,7 @@ def extend_all(start, stop, chains, n_beam, seen, costs):
     return n_beam
 
 
-@njit(cache=True)
+@kernel()
 def trace_back(frame, hypothesis, parent, first, path):
     """Viterbi backtracking: follow the links from a hypothesis back to frame `first`.
 
@@ -233,7 +234,7 @@ def trace_back(frame, hypothesis, parent, first, path):
         frame, hypothesis = parent[frame, hypothesis, 0], parent[frame, hypothesis, 1]
 
 
-@njit(cache=True)
+@kernel()
 def forward_backward(times, one, two, error, evidence, costs, doubt):
     """Forward-backward over two states: fill the flip posterior of each frame.
 

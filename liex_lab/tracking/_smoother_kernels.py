@@ -15,11 +15,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import place_joints
 from liex_lab.geometry._kernels import cholesky, exp_so3, log_so3, substitute
+from liex_lab.runtime.kernels import inner_kernel, kernel
 
 
 class Moves(NamedTuple):
@@ -80,7 +80,7 @@ class Spread(NamedTuple):
     bend: NDArray[np.float64]
 
 
-@njit(cache=True)
+@kernel()
 def middles(joints, known, tip, middle, frame):
     """Fill the joints' mean of each frame, and the animal's own axes in measured frames.
 
@@ -102,7 +102,7 @@ def middles(joints, known, tip, middle, frame):
             _own_frame(joints[t, tip], joints[t, 0], frame[t])
 
 
-@njit(cache=True)
+@kernel()
 def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
     """Fill measurement weights from their distances to the curve; returns how many are used.
 
@@ -133,7 +133,7 @@ def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
     return n_used
 
 
-@njit(cache=True)
+@kernel()
 def measured_spread(frame, error, weight, used, position_error, correlated_share, variance, r):
     """Fill the variance of each measurement, and the covariance of the joints' mean.
 
@@ -158,7 +158,7 @@ def measured_spread(frame, error, weight, used, position_error, correlated_share
                         )
 
 
-@njit(cache=True)
+@kernel()
 def place_middles(body, middle, made):
     """Translate poses so that their joints have the given means.
 
@@ -187,7 +187,7 @@ def place_middles(body, middle, made):
                 made.joints[t, j, k] += made.place[t, k]
 
 
-@njit(cache=True)
+@inner_kernel()
 def _own_frame(tip, base, out):
     """Axes (3, 3) as columns: from base to tip (3,), sideways and level, and up."""
     x = tip[0] - base[0]
@@ -266,7 +266,7 @@ class Covariances(NamedTuple):
         return cls(np.zeros((n, 2, 2)), np.zeros((n, 2, 2)), np.zeros((n, 2, 2)))
 
 
-@njit(cache=True)
+@kernel()
 def _copy(a, out):
     """Out = a, both (k, l); assigning whole rows compiles to ten times the code."""
     for i in range(out.shape[0]):
@@ -274,7 +274,7 @@ def _copy(a, out):
             out[i, k] = a[i, k]
 
 
-@njit(cache=True)
+@kernel()
 def steps(times, tau, decay, gain_dt):
     """Fill the decay a and the velocity gain g of the step that leads to each frame.
 
@@ -291,7 +291,7 @@ def steps(times, tau, decay, gain_dt):
         gain_dt[t] = tau * (1.0 - decay[t])
 
 
-@njit(cache=True)
+@kernel()
 def gains(times, r, q, tau, start, gain, covariances):
     """Fill Kalman gains, RTS gains and covariances of one scalar coordinate over n frames.
 
@@ -372,7 +372,7 @@ def gains(times, r, q, tau, start, gain, covariances):
                 smoothed[t, i, j] = f[i, j] + back[i, j]
 
 
-@njit(cache=True)
+@inner_kernel()
 def _value_variance(dt, tau):
     """Q11 / q, s^3: process variance of the value after dt s; a series for small dt / τ."""
     x = dt / tau
@@ -382,7 +382,7 @@ def _value_variance(dt, tau):
     return tau**2 * (dt - 2.0 * tau * (1.0 - a) + 0.5 * tau * (1.0 - a * a))
 
 
-@njit(cache=True)
+@kernel()
 def smooth_values(y, known, start, gain, out, rate):
     """Filter and smooth one scalar coordinate with the gains of `gains`.
 
@@ -417,7 +417,7 @@ def smooth_values(y, known, start, gain, out, rate):
         out[t] = out[start]
 
 
-@njit(cache=True)
+@kernel()
 def smooth_positions(times, y, r, known, start, process_variance, tau, out, spread):
     """Filter and smooth positions with full measurement covariances; the state is (6,).
 
@@ -491,7 +491,7 @@ def smooth_positions(times, y, r, known, start, process_variance, tau, out, spre
         _copy(p[max(t, start)], spread[t])
 
 
-@njit(cache=True)
+@kernel()
 def _predict(state, p, dt, process_variance, tau, ahead, m):
     """Kalman prediction: fill ahead (6,) and m (6, 6) from a state and its covariance."""
     decay = np.exp(-dt / tau)
@@ -516,7 +516,7 @@ def _predict(state, p, dt, process_variance, tau, ahead, m):
         m[3 + k, 3 + k] += process_variance[k] * 0.5 * tau * (1.0 - decay * decay)
 
 
-@njit(cache=True)
+@inner_kernel()
 def _rts_pass(times, tau, start, state, p, ahead, m):
     """Rauch-Tung-Striebel pass, in place, over states (n, 6) and covariances (n, 6, 6)."""
     inverse = np.zeros((6, 6))
@@ -546,7 +546,7 @@ def _rts_pass(times, tau, start, state, p, ahead, m):
                 p[t, i, k] += total
 
 
-@njit(cache=True)
+@inner_kernel()
 def _multiply(a, b, out):
     """Out = a b, all (6, 6)."""
     for i in range(6):
@@ -557,7 +557,7 @@ def _multiply(a, b, out):
             out[i, k] = total
 
 
-@njit(cache=True)
+@inner_kernel()
 def _invert(a, out, work):
     """Out = inverse of a symmetric positive definite matrix (k, k), by Cholesky in `work`."""
     cholesky(a, work, 1e-300)
@@ -567,7 +567,7 @@ def _invert(a, out, work):
         substitute(work, out[:, c])
 
 
-@njit(cache=True)
+@kernel()
 def _moved(r, w, out):
     """Out = r exp(w)."""
     step = np.empty((3, 3))
@@ -577,7 +577,7 @@ def _moved(r, w, out):
             out[i, k] = r[i, 0] * step[0, k] + r[i, 1] * step[1, k] + r[i, 2] * step[2, k]
 
 
-@njit(cache=True)
+@kernel()
 def _between(a, b, out):
     """Out = log(a^T b)."""
     turn = np.empty((3, 3))
@@ -587,7 +587,7 @@ def _between(a, b, out):
     log_so3(turn, out)
 
 
-@njit(cache=True)
+@kernel()
 def smooth_rotations(y, known, start, gain, out, rate):
     """Filter and smooth rotations by the left-invariant error: `smooth_values` on SO(3).
 

@@ -13,12 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
+from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.height_maps import HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
@@ -54,7 +54,7 @@ def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out, start, stop):
     """Fill out (n,) with the share of the edges of each height map (n, S, S) behind an object."""
     for i in range(start, stop):
@@ -80,7 +80,7 @@ def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out, start
         out[i] = n_behind / max(n_edges, 1)
 
 
-@njit(cache=True)
+@kernel()
 def _is_behind_another(height, step, r, c, depth, v, u, dr, dc, nearer, reach_px):
     """The same as `is_behind` for the cell (r, c), without readings of the animal's own cells."""
     size = height.shape[0]
@@ -93,7 +93,7 @@ def _is_behind_another(height, step, r, c, depth, v, u, dr, dc, nearer, reach_px
     return False
 
 
-@njit(cache=True)
+@kernel()
 def is_behind(depth, v, u, dv, du, nearer, reach_px):
     """Whether a reading nearer than `nearer`, or the image edge, is close in one direction."""
     for k in range(1, reach_px + 1):
@@ -206,7 +206,7 @@ class OcclusionCorrection:
         return out
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _look(heights, origin, step, distance, depths, ends, before, out, start, stop):
     """Fill out (n, 5) with the visible pixels of each animal along its line from base to tip.
 
@@ -253,7 +253,7 @@ def _look(heights, origin, step, distance, depths, ends, before, out, start, sto
             out[i, 2] = (aside / covered - middle / n) / max(0.5 * (last - first), 1e-6)
 
 
-@njit(cache=True)
+@kernel()
 def _beside(depth, v, u, step, nearer):
     """Whether a pixel is within three crop pixels of a nearer one or of the image edge."""
     for dv, du in ((1, 0), (-1, 0), (0, 1), (0, -1)):

@@ -17,12 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
+from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.threads import in_parallel
 from liex_lab.scene.height_maps import CROP, HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
@@ -112,7 +112,7 @@ class BodyResidual:
         )
         in_parallel(
             _compare,
-            n,
+            out.shape[1],
             rendered,
             crops.heights,
             crops.origin,
@@ -190,7 +190,7 @@ def render_crops(
     return render_meshes(vertices, surface.faces, T_camera_arena, scaled, origin, (CROP, CROP))
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _compare(rendered, heights, origin, step, planes, distance, joints, out, start, stop):
     """Median |rendered - observed| depth, mm, over pixels where both are, the share of the observed
     pixels that are covered, the share of the rendered ones outside, and the largest median
@@ -227,7 +227,7 @@ def _compare(rendered, heights, origin, step, planes, distance, joints, out, sta
         out[3, i] = _worst_part(offset[:n], part[:n], joints.shape[1], own) if enough else np.nan
 
 
-@njit(cache=True)
+@kernel()
 def _nearest(joints, u, v):
     """Which of the joints (J, 2) px is nearest to a pixel."""
     best = 0
@@ -240,7 +240,7 @@ def _nearest(joints, u, v):
     return best
 
 
-@njit(cache=True)
+@kernel()
 def _worst_part(offset, part, n_parts, own):
     """The largest median of the offsets (k,) of one part, of those with enough pixels; 0 if none
     has. own is scratch, as long at least.
@@ -257,7 +257,7 @@ def _worst_part(offset, part, n_parts, own):
     return worst
 
 
-@njit(cache=True)
+@kernel()
 def median_of(values):
     """The median of numbers by Hoare's selection; numpy's own takes three times as long to compile.
 
