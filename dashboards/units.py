@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -63,23 +64,39 @@ def day(iso: str) -> str:
     return f"{when.day} {when:%B %Y, %H:%M:%S}{told}"
 
 
-# HTML pages from Jinja templates.
+# Texts from Jinja templates
 
 
-def page(template: Path, **shown: Any) -> str:
-    """An HTML page from its Jinja template; values are escaped, a missing value is an error.
+@cache
+def _template(file: Path) -> Any:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoescape
 
-    Args:
-        template: the file, HTML with Jinja's marks.
-        shown: the values of the template's variables.
-    """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    pages = Environment(
-        loader=FileSystemLoader(template.parent),
-        autoescape=True,
+    texts = Environment(
+        loader=FileSystemLoader(file.parent),
+        autoescape=select_autoescape(("html.j2",)),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return pages.get_template(template.name).render(**shown)
+    return texts.get_template(file.name)
+
+
+def page(template: Path, **shown: Any) -> str:
+    """A text from its Jinja template; in HTML values are escaped; a missing value is an error.
+
+    Args:
+        template: the file; HTML if its name ends in .html.j2.
+        shown: the values of the template's variables.
+    """
+    return str(_template(template).render(**shown))
+
+
+def paragraphs(template: Path, **shown: Any) -> list[str]:
+    """The paragraphs of a text; <paragraph> begins one, and spaces do not matter.
+
+    Args:
+        template: the file, see `page`.
+        shown: the values of the template's variables.
+    """
+    parts = (" ".join(part.split()) for part in page(template, **shown).split("<paragraph>"))
+    return [part for part in parts if part]

@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from liex_lab.dashboards.figures.sets import for_the_page
-from liex_lab.dashboards.report.charts import pictures
+from liex_lab.dashboards.report.contact_sheet import thumbnails
 from liex_lab.dashboards.report.report import TEMPLATES
 
 from liex_lab.sessions import Session
@@ -38,7 +38,7 @@ def page(session: Session) -> str:
     template = (TEMPLATES / "report.html.j2").read_text(encoding="utf-8")
     style = re.search(r"<style>(.*?)</style>", template, re.DOTALL)
     drawn = for_the_page(session, None)
-    sheet = pictures(session)
+    sheet = thumbnails(session)
     some = sorted(
         {round(k * (len(sheet) - 1) / (_SHOWN - 1)) for k in range(_SHOWN)} if sheet else ()
     )

@@ -151,14 +151,13 @@ def serve_dashboard(
     from liex_lab.pipelines.study.run import list_sessions
 
     try:
-        from liex_lab.dashboards.app.guard import LOOPBACK
-        from liex_lab.dashboards.app.server import address, make_app, serve
+        from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
     except ModuleNotFoundError as error:
         raise MissingPackageError(
             f"the dashboard needs {error.name}; {how_to_install('dashboard')}"
         ) from None
     from liex_lab.dashboards.app.data import StudyData
-    from liex_lab.dashboards.report.views import write_views
+    from liex_lab.dashboards.report.report import write_views
     from liex_lab.pipelines.correct import correct_session
     from liex_lab.pipelines.region_config import StatedRegions
     from liex_lab.pipelines.training.action_model import suggest

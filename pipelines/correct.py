@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from liex_lab.dashboards.replay.layouts import replay_blueprint
-from liex_lab.dashboards.report.views import write_views
+from liex_lab.dashboards.report.report import write_views
 from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN

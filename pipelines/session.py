@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from liex_lab.dashboards.replay.layouts import replay_blueprint
-from liex_lab.dashboards.report.views import write_views
+from liex_lab.dashboards.report.report import write_views
 
 from liex_lab.actions import ethogram, timeline, vocabulary
 from liex_lab.behaviour import summary

@@ -99,7 +99,7 @@ def test_ci_runs_exactly_the_line_of_the_readme() -> None:
     assert "export CI=true" in script
 
 
-IMPORTS = "import liex_lab.pipelines.session, liex_lab.dashboards.report.views, liex_lab.api"
+IMPORTS = "import liex_lab.pipelines.session, liex_lab.dashboards.report.report, liex_lab.api"
 
 
 def python_in_the_clone(*arguments: str, clone: Path = REPOSITORY) -> str:

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import pandas as pd
 
 from liex_lab.actions.vocabulary import PALETTE, action_colours
 from liex_lab.behaviour import cohort
@@ -24,10 +27,8 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import LOG, corrected_folder
 from liex_lab.sessions.verdict import WHO, Entry
 
-from ..report.quality import warnings
-
-if TYPE_CHECKING:
-    import pandas as pd
+from ..figures.animals import Recent
+from ..report.facts import warnings
 
 DONE = ("done", "changed")  # states of sessions with results
 NO_POSE = "no pose or no frame"
@@ -70,45 +71,33 @@ class StudyData:
         entries: key -> state of each session, in the study's order.
     """
 
-    def __init__(self, name: str, look: Callable[[], Sequence[Entry]]) -> None:
+    def __init__(self, name: str, list_entries: Callable[[], Sequence[Entry]]) -> None:
         self.name = name
-        self._look = look
+        self._list_entries = list_entries
         self._lock = threading.RLock()
-        self._kept: dict[tuple[str, str], tuple[Any, Any]] = {}
+        self._facts: dict[str, tuple[Any, dict[str, Any]]] = {}
         self._stats: dict[Any, pd.DataFrame] = {}
         self._whole: tuple[Any, pd.DataFrame] | None = None
-        self._open: dict[str, tuple[Any, Session]] = {}
+        self._open = Recent(_HELD)
         self.entries: dict[str, Entry] = {}
         self.refresh()
 
     def refresh(self) -> None:
         """Update the list of sessions and their states."""
-        found = self._look()
-        with self._lock:
-            self.entries = {entry.key: entry for entry in found}
-            self._stats.clear()
+        self.entries = {entry.key: entry for entry in self._list_entries()}
 
     def warm(self, progress: Progress = silent) -> None:
         """Read the data of the first page; a thread then reads those of the other pages."""
         entries = self.done
         for k, entry in enumerate(entries):
             progress(k, len(entries), "reading sessions")
-            self._of_one("quality", _quality, entry)
-        threading.Thread(target=self._read_ahead, daemon=True).start()
-
-    def _read_ahead(self) -> None:
-        """Read the data of the ethogram and group pages."""
-        self.ethograms([entry.key for entry in self.done])
-        self.collected()
+            self._facts_of(entry)
+        threading.Thread(target=self.collected, daemon=True).start()
 
     @property
     def done(self) -> list[Entry]:
         """The sessions with results."""
-        return [
-            entry
-            for entry in self.entries.values()
-            if entry.state in DONE and entry.folder is not None
-        ]
+        return [one for one in self.entries.values() if one.state in DONE and one.folder]
 
     def session(self, key: str) -> Session:
         """An opened session; the same object until its folder changes.
@@ -121,15 +110,7 @@ class StudyData:
             raise SessionError(
                 f"the study has no measured session '{key}'; see the list of its sessions"
             )
-        stamp = _stamp(entry.folder)
-        with self._lock:
-            known = self._open.pop(key, None)
-            if known is None or known[0] != stamp:
-                known = (stamp, Session.open(entry.folder))
-            self._open[key] = known  # at the end: the first ones are removed first
-            while len(self._open) > _HELD:
-                self._open.pop(next(iter(self._open)))
-            return known[1]
+        return self._open.get(key, _stamp(entry.folder), partial(Session.open, entry.folder))
 
     def read(self, key: str, make: Callable[[Session], Made]) -> Made:
         """The result of `make`, repeated while a correction replaces the session's tables.
@@ -151,11 +132,7 @@ class StudyData:
 
     def overview(self) -> pd.DataFrame:
         """One row per session: subject, state, and quality (the columns `QUALITY`)."""
-        import pandas as pd
-
-        measured = dict(
-            zip((entry.key for entry in self.done), self._of_all("quality", _quality), strict=True)
-        )
+        measured = {entry.key: facts["quality"] for entry, facts in self._measured()}
         rows = [
             {
                 "session": entry.key,
@@ -171,56 +148,38 @@ class StudyData:
 
     def ethograms(self, keys: Iterable[str]) -> dict[str, Ethogram]:
         """The ethograms of measured sessions by key; unreadable ones are left out."""
-        done = {entry.key: entry for entry in self.done}
-        entries = [done[key] for key in keys if key in done]
-        found = self._of_all("ethogram", _ethogram, entries)
-        return {
-            entry.key: one
-            for entry, one in zip(entries, found, strict=True)
-            if isinstance(one, Ethogram)
-        }
-
-    def damage(self, key: str) -> str:
-        """The damage of a session's ethogram as a sentence; empty if it is readable."""
-        entry = self.entries[key]
-        found = self._of_one("ethogram", _ethogram, entry)
-        return "" if isinstance(found, Ethogram) else str(found["damage"])
+        found = {entry.key: facts["ethogram"] for entry, facts in self._measured()}
+        return {key: found[key] for key in keys if isinstance(found.get(key), Ethogram)}
 
     def collected(self) -> pd.DataFrame:
         """One row per measured session, as needed by `cohort.compare`, with its `key`.
 
-        The animals and groups of the study override those of the session.
+        The animals and groups of the study override those of the session. `attrs["check"]` has
+        sentences on possible mistakes in their names.
         """
-        import pandas as pd
-
-        done = self.done
-        found = self._of_all("summary", _summary)
-        state = [
-            (id(table), entry.key, *entry.who.items())
-            for entry, table in zip(done, found, strict=True)
-        ]
+        measured = self._measured()
+        state = [(entry.key, self._facts[entry.key][0], entry.who) for entry, _ in measured]
         with self._lock:
             if self._whole is not None and self._whole[0] == state:
                 return self._whole[1]
-        tables = []
-        for entry, table in zip(done, found, strict=True):
-            if isinstance(table, pd.DataFrame):
-                stated = {name: value for name, value in entry.who.items() if value}
-                tables.append(table.assign(key=entry.key, **stated))
+        tables = [
+            facts["summary"].assign(key=entry.key, **{k: v for k, v in entry.who.items() if v})
+            for entry, facts in measured
+            if isinstance(facts["summary"], pd.DataFrame)
+        ]
         whole = pd.DataFrame(columns=["key", "session_id", *WHO])
         if tables:
             whole, notes = cohort.unified(pd.concat(tables, ignore_index=True))
             whole.attrs["check"] = notes
         with self._lock:
             self._whole = (state, whole)
+            self._stats.clear()
         return whole
-
-    def to_check(self) -> list[str]:
-        """Sentences on possible mistakes in the names of animals and groups."""
-        return list(self.collected().attrs.get("check", ()))
 
     def stats(self, measure: str, reference: str | None = None) -> pd.DataFrame:
         """The table `stats` of the usual measures and this one, with p corrected for all of them.
+
+        It is kept until a session changes.
 
         Args:
             measure: a column of the summaries.
@@ -241,60 +200,52 @@ class StudyData:
         Returns:
             Two empty texts if no session has it.
         """
-        for entry in self.done:
-            columns = self._of_one("columns", lambda session: session.columns, entry)
-            if not isinstance(columns, dict):
-                own = columns[(columns["table"] == "summary") & (columns["name"] == measure)]
-                if len(own):
-                    return str(own["unit"].iloc[0] or ""), str(own["meaning"].iloc[0])
+        for columns in self._columns():
+            if measure in columns.index:
+                return str(columns.loc[measure, "unit"] or ""), str(columns.loc[measure, "meaning"])
         return "", ""
 
     def units(self) -> dict[str, str]:
         """The unit of every measure, from the columns of one session; "" for dimensionless ones."""
-        for entry in self.done:
-            columns = self._of_one("columns", lambda session: session.columns, entry)
-            if not isinstance(columns, dict):
-                own = columns[columns["table"] == "summary"]
-                return {
-                    str(name): unit if isinstance(unit, str) else ""
-                    for name, unit in zip(own["name"], own["unit"], strict=True)
-                }
+        for columns in self._columns():
+            return {str(name): str(unit or "") for name, unit in columns["unit"].items()}
         return {}
 
-    def _of_all(
-        self, what: str, read: Callable[[Session], Any], entries: Sequence[Entry] | None = None
-    ) -> list[Any]:
-        """`read` of every measured session; cached until its folder changes."""
-        chosen = self.done if entries is None else entries
-        with ThreadPoolExecutor(_READERS) as pool:
-            return list(pool.map(lambda entry: self._of_one(what, read, entry), chosen))
+    def _columns(self) -> Iterator[pd.DataFrame]:
+        """The columns of the summaries of the sessions: unit and meaning by name."""
+        for entry in self.done:
+            with suppress(LiexError):
+                columns = self.session(entry.key).columns
+                summary = columns[columns["table"] == "summary"].set_index("name")
+                yield summary.astype(object).where(summary.notna(), "")
 
-    def _of_one(self, what: str, read: Callable[[Session], Any], entry: Entry) -> Any:
+    def _measured(self) -> list[tuple[Entry, dict[str, Any]]]:
+        """Every measured session with its facts."""
+        done = self.done
+        with ThreadPoolExecutor(_READERS) as pool:
+            return list(zip(done, pool.map(self._facts_of, done), strict=True))
+
+    def _facts_of(self, entry: Entry) -> dict[str, Any]:
+        """What the study's pages show of a session (`_FACTS`); kept until its folder changes."""
         folder = entry.folder
         assert folder is not None
-        stamp = _stamp(folder)
-        known = self._kept.get((what, entry.key))
+        stamp, session = _stamp(folder), None
+        known = self._facts.get(entry.key)
         if known is not None and known[0] == stamp:
             return known[1]
-        session: list[Session] = []
-
-        def value_of(read: Callable[[Session], Any]) -> Any:
+        facts = {}
+        for what, read in _FACTS.items():  # all at once, since opening checks the whole session
             try:
-                if not session:
-                    session.append(Session.open(folder))
-                return read(session[0])
+                session = session or Session.open(folder)
+                facts[what] = read(session)
             except LiexError as error:
-                return {"damage": str(error)}
+                facts[what] = {"damage": str(error)}
             except Exception as error:  # one bad session must not break the study's pages
-                return {
-                    "damage": f"{folder} cannot be shown ({type(error).__name__}: "
-                    f"{one_line(error)}); look at it with `liex verify`"
-                }
-
-        # opening checks the whole session, so read at once what the study's pages will need
-        for name, other in {**_OF_STUDY, what: read}.items():
-            self._kept[name, entry.key] = (stamp, value_of(other))
-        return self._kept[what, entry.key][1]
+                reason = f"{type(error).__name__}: {one_line(error)}"
+                remedy = "check it with `liex verify`"
+                facts[what] = {"damage": f"{folder} cannot be shown ({reason}); {remedy}"}
+        self._facts[entry.key] = (stamp, facts)
+        return facts
 
 
 QUALITY = (
@@ -339,11 +290,6 @@ def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str
     return {word: chosen.get(word) or next(free, GREY) for word in words}
 
 
-def vocabulary_of(ethograms: Iterable[Ethogram]) -> list[str]:
-    """The words of several vocabularies, in order of first occurrence."""
-    return list(dict.fromkeys(word for one in ethograms for word in one.vocabulary))
-
-
 def raster(
     one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int
 ) -> np.ndarray:
@@ -382,14 +328,12 @@ def raster(
 
 def _stamp(folder: Path) -> Any:
     """Times, sizes and inodes; they change when the session is rewritten or corrected."""
-    stamps: list[tuple[int, int, int] | None] = []
+    stamps: dict[str, tuple[int, int, int]] = {}
     for path in (folder / "session.json", corrected_folder(folder) / LOG):
-        try:
+        with suppress(OSError):
             found = path.stat()
-            stamps.append((found.st_mtime_ns, found.st_size, found.st_ino))
-        except OSError:
-            stamps.append(None)
-    return tuple(stamps)
+            stamps[path.name] = (found.st_mtime_ns, found.st_size, found.st_ino)
+    return stamps
 
 
 def _quality(session: Session) -> dict[str, Any]:
@@ -426,12 +370,10 @@ def _ethogram(session: Session) -> Ethogram:
 
 
 def _summary(session: Session) -> pd.DataFrame | None:
-    if not session.has("summary.csv"):
-        return None
-    return cohort.collect([session])
+    return cohort.collect([session]) if session.has("summary.csv") else None
 
 
-_OF_STUDY: dict[str, Callable[[Session], Any]] = {
+_FACTS: dict[str, Callable[[Session], Any]] = {
     "quality": _quality,
     "ethogram": _ethogram,
     "summary": _summary,

@@ -1,4 +1,4 @@
-"""Data of the correction page: times, joints, bouts, doubtful stretches and depth images.
+"""Data of the correction page: times, joints, bouts, doubtful stretches, crossings, depth images.
 
 A session of an hour has a hundred thousand frames, so the page requests the joints of a few hundred
 rows at a time, and one image at a time.
@@ -6,130 +6,83 @@ rows at a time, and one image at a time.
 
 from __future__ import annotations
 
-import importlib
-import threading
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
+from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import action_colours
+from liex_lab.behaviour.kinematics import IMPOSSIBLE_MM_S
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import disagreements
 from liex_lab.sessions.corrections import author_name, read_log
+from liex_lab.sessions.evidence import read_centres
 
-from ..figures.seen import animals, joints_in_picture
-from ..video.film import way_of
-from ..video.relief import Relief, scale_mm
-from .crossings import crossings
-from .frames import Frames
+from ..figures.animals import Array, DepthImages, Recent, SessionAnimal
+from ..report.contact_sheet import png
+from ..video.film import Footage
 from .tables import records
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-Array = NDArray[np.float64]
-Suggest = Callable[[Path], "pd.DataFrame"]
+Suggest = Callable[[Path], pd.DataFrame]
+Stretch = dict[str, Any]  # start_s, stop_s, kind and why
 
 MOST_ROWS = 2000  # per request
-_LEAST_DOUBT_S = 0.5  # doubtful frames closer in time form one stretch
+_NEAR_S = 0.5  # frames or events closer in time form one stretch
 _HELD = 6  # desks that stay in memory
-_FIRST = (
-    "liex_lab.recordings.formats.messages.mcap",
-    "cv2",
-    "matplotlib",
-    "pyarrow.parquet",
-)
 
 
-class Desk:
+class Desk(Footage):
     """The current state of one session, as JSON for the page.
 
     Args:
-        key: the session's name in the study.
         session: the opened session.
-        frames: the depth images.
+        images: the depth images.
+        suggest: finds the stretches whose actions are least certain; None finds none.
     """
 
-    def __init__(self, key: str, session: Session, frames: Frames) -> None:
-        self.key = key
-        self.session = session
-        self._frames = frames
-        self.seen = animals(session)
-
-    @cached_property
-    def time_s(self) -> Array:
-        """(n,) times of the frames, s."""
-        return self.seen[0].frames["time_s"].to_numpy(float)
+    def __init__(
+        self, session: Session, images: DepthImages, suggest: Suggest | None = None
+    ) -> None:
+        super().__init__(session, images)
+        self._suggest = suggest
 
     @cached_property
     def _numbers(self) -> dict[str, Any]:
         """Columns of `frames` that are sent for every frame."""
         names = ["flag", "predicted_error_mm", "p_flip", "frame_index"]
-        if len(self.seen) > 1:
-            names.append("individual")
-        table = self.session.table("frames", names)
-        if len(self.seen) > 1:
-            table = table[table["individual"].astype(str) == self.seen[0].individual]
+        more = [] if self.animals[0].alone else ["individual"]
+        table = self.animals[0].rows_of(self.session.table("frames", [*names, *more]))
         return {name: table[name].to_numpy() for name in names}
-
-    @cached_property
-    def uv(self) -> list[Array]:
-        """The joints of each animal (n, J, 2), px; NaN without a pose."""
-        return joints_in_picture(self.seen, len(self.time_s))
-
-    @cached_property
-    def _ways(self) -> list[tuple[Array, int]]:
-        return [way_of(joints, self.session.camera) for joints in self.uv]
-
-    @cached_property
-    def _relief(self) -> Relief:
-        return Relief(self.session, scale_mm([self.session]))
 
     @cached_property
     def notes(self) -> list[str]:
         """Sentences on exchanges of head and tail that contradict the neighbouring frames."""
         return disagreements(self.session)
 
-    def row_at(self, at_s: float) -> int:
-        """Row of the frame nearest in time to `at_s` (s since the first frame)."""
-        return int(np.abs(self.time_s - at_s).argmin())
-
-    def open_ahead(self) -> None:
-        """Prepare the data of the first image before it is requested."""
-        self._frames.depth(self.key, self.session, 0)
-        self.about()
-        self.rows(0, 1)
-        len(self.session.frames)  # shown on the page
-
     def about(self) -> dict[str, Any]:
         """Facts that the page needs once: size, animals, coloured actions, and the author."""
-        camera = self.session.camera
         animal = self.session.metadata["animal"]
-        words = list(self.session.metadata.get("actions") or {})
-        colours = action_colours(words)
         steps = np.diff(self.time_s)
         return {
             "n": len(self.time_s),
             "duration_s": float(self.time_s[-1]),
             "frame_s": float(np.median(steps)) if len(steps) else 1.0 / 30.0,
-            "width": camera.width,
-            "height": camera.height,
-            "top_mm": self._relief.top_mm,
+            "width": self.session.camera.width,
+            "height": self.session.camera.height,
+            "top_mm": self.relief.top_mm,
             "joints": [str(name) for name in animal["joints"]],
-            "bones": [[int(a), int(b)] for a, b in animal["bones"]],
+            "bones": self.bones,
             "animals": [
-                {"name": seen.who, "half_px": half}
-                for seen, (_, half) in zip(self.seen, self._ways, strict=True)
+                {"name": one.who, "half_px": half}
+                for one, (_, half) in zip(self.animals, self.paths, strict=True)
             ],
-            "actions": [
-                {"word": word, "title": word.replace("_", " "), "colour": colours[word]}
-                for word in words
-            ],
+            "actions": coloured_actions(list(self.session.metadata.get("actions") or {})),
             "author": author_name(),
         }
 
@@ -151,59 +104,59 @@ class Desk:
             "frame": [int(index) for index in numbers["frame_index"][rows]],
             "animals": [
                 {"uv": _plain(uv[rows]), "middle": _plain(middle[rows])}
-                for uv, (middle, _) in zip(self.uv, self._ways, strict=True)
+                for uv, (middle, _) in zip(self.uv, self.paths, strict=True)
             ],
         }
 
     def bouts(self) -> list[dict[str, Any]]:
         """Every bout: action, start_s, stop_s, source and score."""
-        names = ("action", "start_s", "stop_s", "source", "score")
-        table = self.seen[0].bouts
-        columns = [table[name].tolist() for name in names]
-        return [
-            {
-                "action": str(action),
-                "start_s": float(start),
-                "stop_s": float(stop),
-                "source": str(source),
-                "score": None if not np.isfinite(score) else round(float(score), 3),
-            }
-            for action, start, stop, source, score in zip(*columns, strict=True)
-        ]
+        names = ["action", "start_s", "stop_s", "source", "score"]
+        table = self.animals[0].bouts[names].astype({"action": str, "source": str})
+        score = table["score"].astype(float).round(3).astype(object)
+        return records(table.assign(score=score.where(score.notna(), None)))
 
-    def doubts(self) -> list[dict[str, Any]]:
-        """Doubtful stretches of poses in order of time: start_s, stop_s, kind and why."""
-        found: list[dict[str, Any]] = [
-            {"start_s": a, "stop_s": b, "kind": "pose", "why": f"pose in doubt: {_error(error)}"}
-            for a, b, error in self._doubtful_runs()
-        ]
+    def doubts(self) -> list[Stretch]:
+        """Doubtful stretches of poses in order of time."""
+        rows = np.flatnonzero(self._numbers["flag"].astype(str) == "doubtful")
+        error = self._numbers["predicted_error_mm"].astype(float)
+        found = []
+        for run in _runs(self.time_s[rows], self.time_s[rows]):
+            most = float(error[rows[run]].max())
+            size = f"error {most:.1f} mm" if np.isfinite(most) else "error not known"
+            at = self.time_s[rows[run]]
+            found.append(_stretch(at[0], at[-1], "pose", f"pose in doubt: {size}"))
         flips = self.session.flips
         for flip in records(flips[~flips["applied"].astype(bool)]):
             why = f"head and tail perhaps exchanged (p {float(flip['p_flip']):.2f})"
-            found.append(_doubt(flip, "flip", why))
+            found.append(_stretch(flip["start_s"], flip["stop_s"], "flip", why))
         bouts = self.session.bouts
         if "contradicts" in bouts:
             for bout in records(bouts[bouts["contradicts"].fillna("").astype(str) != ""]):
                 word = str(bout["action"]).replace("_", " ")
                 why = f"{word} contradicts its definition: {bout['contradicts']}"
-                found.append(_doubt(bout, "action", why))
-        return sorted(found, key=lambda one: one["start_s"])
+                found.append(_stretch(bout["start_s"], bout["stop_s"], "action", why))
+        return sorted(found, key=lambda one: float(one["start_s"]))
 
-    def crossings(self) -> list[dict[str, Any]]:
-        """Where ends or animals may have been exchanged, see `crossings.Crossing`."""
-        return crossings(self.session, self.seen)
-
-    def _doubtful_runs(self) -> list[tuple[float, float, float]]:
-        """Start, stop (s) and largest predicted error (mm) of the runs of doubtful frames."""
-        rows = np.flatnonzero(self._numbers["flag"].astype(str) == "doubtful")
-        if not len(rows):
-            return []
-        far = np.flatnonzero(np.diff(self.time_s[rows]) > _LEAST_DOUBT_S) + 1
-        error = self._numbers["predicted_error_mm"].astype(float)
+    @cached_property
+    def suggested(self) -> list[Stretch]:
+        """The stretches whose actions are least certain; none without a model."""
+        try:
+            rows = [] if self._suggest is None else records(self._suggest(self.session.path))
+        except LiexError:  # no recogniser for this animal
+            rows = []
         return [
-            (float(self.time_s[run[0]]), float(self.time_s[run[-1]]), float(error[run].max()))
-            for run in np.split(rows, far)
+            _stretch(
+                row["start_s"],
+                row["stop_s"],
+                "action",
+                f"{row['guess']} or {row['or_else']}?".replace("_", " "),
+            )
+            for row in rows
         ]
+
+    def crossings(self) -> list[Stretch]:
+        """Where ends or animals may have been exchanged, see `crossings`."""
+        return crossings(self.session, self.animals)
 
     def log(self) -> list[dict[str, Any]]:
         """The corrections in effect: number, message (said), author and date."""
@@ -222,7 +175,7 @@ class Desk:
         redoable = read_log(self.session.path).redoable
         return "" if redoable is None else str(redoable[1])
 
-    def picture(self, row: int, box: Sequence[int]) -> bytes:
+    def image(self, row: int, box: Sequence[int]) -> bytes:
         """PNG of a part of a frame as relief: height above the floor in colours, with shading.
 
         Args:
@@ -232,25 +185,13 @@ class Desk:
         Raises:
             SessionError: there is no such frame, or the box lies outside the image.
         """
-        import cv2
-
         camera = self.session.camera
-        left, top = (int(np.clip(box[k], 0, size)) for k, size in enumerate(_size(camera)))
-        width, height = (
-            int(np.clip(box[k] + box[k + 2], 0, size)) - at
-            for k, (at, size) in enumerate(zip((left, top), _size(camera), strict=True))
-        )
-        if not 0 <= row < len(self.time_s) or width < 1 or height < 1:
+        corners = np.array([box[:2], np.add(box[:2], box[2:])])
+        (left, top), (right, low) = np.clip(corners, 0, [camera.width, camera.height]).tolist()
+        if not 0 <= row < len(self.time_s) or right <= left or low <= top:
             raise SessionError(f"there is no part {list(box)} of a frame in row {row}")
-        depth = self._frames.depth(self.key, self.session, row)
-        if depth is None:
-            depth = np.zeros((camera.height, camera.width), np.uint16)
-        side = (width, height)
-        drawn = self._relief.picture(depth, left, top, side, side)
-        done, png = cv2.imencode(".png", drawn[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        if not done:
-            raise SessionError(f"the picture of row {row} cannot be made")
-        return bytes(png)
+        side = (right - left, low - top)
+        return png(self.relief.image(self.depth(row), left, top, side, side), fast=True)
 
 
 class Desks:
@@ -258,22 +199,17 @@ class Desks:
 
     Args:
         find: opens a session by its key; returns the same object until its folder changes.
-        frames: the depth images.
-        suggest: finds the stretches of the session in a folder whose actions are least certain;
-            None finds none.
+        images: the depth images.
+        suggest: as of `Desk`.
     """
 
     def __init__(
-        self, find: Callable[[str], Session], frames: Frames, suggest: Suggest | None = None
+        self, find: Callable[[str], Session], images: DepthImages, suggest: Suggest | None = None
     ) -> None:
         self._find = find
-        self._frames = frames
+        self._images = images
         self._suggest = suggest
-        self._lock = threading.Lock()
-        self._ahead = threading.Semaphore()
-        self._known: dict[str, Desk] = {}
-        self._suggested: dict[str, tuple[Session, list[dict[str, Any]]]] = {}
-        threading.Thread(target=_import, daemon=True).start()
+        self._kept = Recent(_HELD)
 
     def of(self, key: str) -> Desk:
         """The desk of the session `key`.
@@ -282,77 +218,28 @@ class Desks:
             SessionError: there is no such session.
         """
         session = self._find(key)
-        with self._lock:
-            known = self._known.get(key)
-            if known is None or known.session is not session:
-                known = self._known[key] = Desk(key, session, self._frames)
-                while len(self._known) > _HELD:
-                    self._known.pop(next(iter(self._known)))
-            return known
-
-    def open_ahead(self, key: str) -> None:
-        """Prepare a session's first image in a thread; does nothing if another is being prepared.
-
-        An unknown `key` is ignored.
-        """
-
-        def make() -> None:
-            try:
-                self.of(key).open_ahead()
-            except LiexError:  # the page shows the reason
-                pass
-            finally:
-                self._ahead.release()
-
-        if self._ahead.acquire(blocking=False):
-            threading.Thread(target=make).start()  # short; the interpreter waits for it at exit
-
-    def suggested(self, key: str) -> list[dict[str, Any]]:
-        """The stretches whose actions are least certain, as `Desk.doubts`; none without a model.
-
-        Raises:
-            SessionError: there is no such session.
-        """
-        session = self._find(key)
-        with self._lock:
-            known = self._suggested.get(key)
-        if known is not None and known[0] is session:
-            return known[1]
-        found: list[dict[str, Any]] = []
-        if self._suggest is not None:
-            try:
-                rows = self._suggest(session.path)
-            except LiexError:  # no recogniser for this animal
-                rows = None
-            for row in records(rows) if rows is not None else ():
-                words = [str(row[name]).replace("_", " ") for name in ("guess", "or_else")]
-                found.append(_doubt(row, "action", f"{words[0]} or {words[1]}?"))
-        with self._lock:
-            self._suggested[key] = (session, found)
-        return found
+        make = partial(Desk, session, self._images, self._suggest)
+        return self._kept.get(key, id(session), make)
 
 
-def _doubt(span: dict[str, Any], kind: str, why: str) -> dict[str, Any]:
-    return {
-        "start_s": float(span["start_s"]),
-        "stop_s": float(span["stop_s"]),
-        "kind": kind,
-        "why": why,
-    }
+def coloured_actions(words: Sequence[str]) -> list[dict[str, str]]:
+    """The actions for a page: word, title and colour."""
+    return [
+        {"word": word, "title": word.replace("_", " "), "colour": colour}
+        for word, colour in action_colours(words).items()
+    ]
 
 
-def _import() -> None:
-    """Import the modules that the first image needs, ahead of its request."""
-    for name in _FIRST:
-        importlib.import_module(name)
+def _stretch(start_s: float, stop_s: float, kind: str, why: str, **more: str) -> Stretch:
+    return {"start_s": float(start_s), "stop_s": float(stop_s), "kind": kind, "why": why, **more}
 
 
-def _size(camera: Any) -> tuple[int, int]:
-    return camera.width, camera.height
-
-
-def _error(error_mm: float) -> str:
-    return f"error {error_mm:.1f} mm" if np.isfinite(error_mm) else "error not known"
+def _runs(start_s: Array, stop_s: Array) -> list[NDArray[np.intp]]:
+    """The rows of spans in order of time, split where they are more than `_NEAR_S` apart."""
+    if not len(start_s):
+        return []
+    far = np.flatnonzero(start_s[1:] - stop_s[:-1] > _NEAR_S) + 1
+    return np.split(np.arange(len(start_s)), far)
 
 
 def _plain(values: Any) -> Any:
@@ -361,3 +248,109 @@ def _plain(values: Any) -> Any:
     rounded = np.round(array, 2).astype(object)
     rounded[~np.isfinite(array)] = None
     return rounded.tolist()
+
+
+# Crossings: stretches in which head and tail, or two animals, may have been exchanged.
+#
+# Exchanges of head and tail come from the table `flips`. The tracker may have changed to another
+# object where the body jumps farther than it can move, and, with several animals in view, where
+# another one comes within a body's length or an animal is found again after a loss.
+
+ENDS = "ends"
+IDENTITY = "identity"
+_SPINE_MM = 90.0  # of an animal of unknown length
+_LEAST_JUMP = 0.5  # of the spine; excludes the jitter of a fast camera
+_HUMAN = "human"
+
+
+def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretch]:
+    """The crossings of a session in order of time.
+
+    Their kind is `ENDS` (head and tail) or `IDENTITY` (the animal and another object); `individual`
+    is the animal's name within the session.
+
+    Args:
+        session: the opened session.
+        animals: its animals, see `session_animals`.
+
+    Raises:
+        SessionError: a table is damaged.
+    """
+    spine_mm = float(session.metadata["animal"].get("spine_mm") or _SPINE_MM)
+    found: list[Stretch] = []
+    for animal in animals:
+        found += [*_exchanged_ends(animal), *_jumps(session, animal, spine_mm)]
+    for one, other in combinations(animals, 2):
+        if len(one.xy_mm) and len(one.xy_mm) == len(other.xy_mm):
+            away_mm = np.linalg.norm(one.xy_mm - other.xy_mm, axis=1)
+            names = f"{one.individual} and {other.individual}"
+            found += _meetings(one, away_mm, spine_mm, names, "perhaps exchanged")
+    if len(animals) == 1 and (session.metadata.get("verdict") or {}).get("n_animals", 1) > 1:
+        centres = read_centres(session)
+        if centres is not None:
+            away_mm = np.linalg.norm(centres[:, 1] - centres[:, 0], axis=1)
+            followed = "perhaps the other is followed"
+            found += _meetings(animals[0], away_mm, spine_mm, "two animals", followed)
+        found += _found_again(animals[0])
+    return sorted(found, key=lambda one: (one["start_s"], one["stop_s"]))
+
+
+def _exchanged_ends(animal: SessionAnimal) -> Iterator[Stretch]:
+    """Stretches with a certain or possible exchange of head and tail; close ones are merged."""
+    table = animal.table("flips")
+    if table is None or not len(table):
+        return
+    table = table.sort_values("start_s")
+    status = np.array([_flip_status(row) for row in records(table)], object)
+    for text, own in table.groupby(status, sort=False):
+        spans = own[["start_s", "stop_s"]].to_numpy(float)
+        for run in _runs(*spans.T):
+            times = f", {len(run)} times" if len(run) > 1 else ""
+            human = own["source"].iloc[run[0]] == _HUMAN
+            sure = "" if human else f" (p {own['p_flip'].iloc[run].max():.2f})"
+            why = f"head and tail {text}{times}{sure}"
+            start_s, stop_s = spans[run[0], 0], spans[run, 1].max()
+            yield _stretch(start_s, stop_s, ENDS, why, individual=animal.individual)
+
+
+def _flip_status(flip: dict[str, Any]) -> str:
+    """The status of a row of the table `flips`, in words."""
+    if flip["source"] == _HUMAN:
+        undone = isinstance(flip.get("undone_at"), str) and flip["undone_at"]
+        return "were exchanged by a person, who took it back" if undone else "exchanged by a person"
+    return "were exchanged and are corrected" if flip["applied"] else "perhaps exchanged"
+
+
+def _jumps(session: Session, animal: SessionAnimal, spine_mm: float) -> Iterator[Stretch]:
+    """Frames between which the body's centre moves faster than the plan allows."""
+    rules = (session.metadata.get("plan") or {}).get("behaviour") or {}
+    fastest_mm_s = float(rules.get("impossible_above_mm_s") or IMPOSSIBLE_MM_S)
+    rows = np.flatnonzero(np.isfinite(animal.xy_mm).all(axis=1))
+    time_s = animal.frames["time_s"].to_numpy(float)[rows]
+    moved_mm = np.linalg.norm(np.diff(animal.xy_mm[rows], axis=0), axis=1)
+    far = (moved_mm > fastest_mm_s * np.diff(time_s)) & (moved_mm > _LEAST_JUMP * spine_mm)
+    for k in np.flatnonzero(far):
+        jump = f"the body jumps {moved_mm[k]:.0f} mm from one frame to the next"
+        why = f"{jump}: perhaps another object is followed"
+        yield _stretch(time_s[k], time_s[k + 1], IDENTITY, why, individual=animal.individual)
+
+
+def _meetings(
+    animal: SessionAnimal, away_mm: Array, spine_mm: float, names: str, result: str
+) -> Iterator[Stretch]:
+    """Where two animals come within a body's length of each other."""
+    rows = np.flatnonzero(away_mm < spine_mm)
+    time_s = animal.frames["time_s"].to_numpy(float)[rows]
+    for run in _runs(time_s, time_s):
+        why = f"{names} come within {away_mm[rows[run]].min():.0f} mm: {result}"
+        start_s, stop_s = time_s[run[[0, -1]]]
+        yield _stretch(start_s, stop_s, IDENTITY, why, individual=animal.individual)
+
+
+def _found_again(animal: SessionAnimal) -> Iterator[Stretch]:
+    """Where the tracked animal was lost and an animal was found again."""
+    last_s = float(animal.frames["time_s"].max())
+    for start_s, stop_s in animal.lost_s:
+        if start_s > 0.0 and stop_s < last_s:
+            why = f"lost for {stop_s - start_s:.2f} s: perhaps another animal is followed since"
+            yield _stretch(start_s, stop_s, IDENTITY, why, individual=animal.individual)

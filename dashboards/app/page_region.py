@@ -6,25 +6,23 @@ written by the owner of the plans (`Regions`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
-from flask import Flask, Response, jsonify, request
+from flask import Response, request
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError, PlanError, SessionError
+from liex_lab.errors import SessionError
+from liex_lab.optics.camera import Camera
 from liex_lab.scene.background import usual_depth
 from liex_lab.sessions import Session
 
-from ..report.contact_sheet import Mark, png_uri, scene_marks, shade, svg_marks
+from ..figures.animals import DepthImages
+from ..report.contact_sheet import png, png_uri, scene_marks, shade, svg_marks
 from .data import StudyData
-from .frames import Frames
 
-if TYPE_CHECKING:
-    from liex_lab.optics.camera import Camera
-
-_N_PICTURES = 9  # the frames from which each pixel's usual depth is computed
+_N_FRAMES = 9  # the frames from which each pixel's usual depth is computed
 _LEAST_REACH_MM = 60.0
 
 
@@ -54,118 +52,95 @@ class Regions(Protocol):
         """The usual depth (mm) of every pixel of the recording `key`, and its camera."""
 
 
-class _Scenes:
-    """Depth images and facts of scenes."""
+class Scenes:
+    """Depth images and facts of scenes.
 
-    def __init__(self, data: StudyData, frames: Frames, regions: Regions | None) -> None:
+    Args:
+        data: the study.
+        images: the depth images.
+        regions: reads and writes regions; None writes none.
+    """
+
+    def __init__(self, data: StudyData, images: DepthImages, regions: Regions | None) -> None:
         self._data = data
-        self._frames = frames
+        self._images = images
         self._regions = regions
 
-    def session(self, key: str) -> Session | None:
+    def about(self, key: str) -> dict[str, Any]:
+        """Facts for the page: image size, marks, and where a region can be saved.
+
+        Raises:
+            LiexError: there is no such recording, or it cannot be read.
+        """
+        session = self._session(key)
+        facts: dict[str, Any] = {"may_save": self._regions is not None, "places": []}
+        facts["region"] = None
+        if self._regions is not None:
+            facts |= self._regions.about(key, session)
+        camera = self._whole(key)[1] if session is None else session.camera
+        marks = [] if session is None else scene_marks(session)
+        found = [
+            {"kind": mark.kind, "said": mark.label, "points": mark.points_px.round(1).tolist()}
+            for mark in marks
+        ]
+        size = {"width": camera.width, "height": camera.height}
+        return {**facts, **size, "measured": session is not None, "marks": found}
+
+    def save(self, key: str) -> Any:
+        """Check and save the requested region; returns the page's new facts.
+
+        The request is JSON with place, corners (px) and was.
+
+        Raises:
+            LiexError: the region is invalid, or cannot be saved.
+        """
+        asked = request.get_json(silent=True)  # another site's form cannot send JSON
+        if self._regions is None or not isinstance(asked, dict):
+            return {"said": "no region is saved here"}, 403 if self._regions is None else 400
+        place = str(asked.get("place"))[:40]
+        corners, was = asked.get("corners"), asked.get("was")
+        report = self._regions.save(key, self._session(key), place, corners, was)
+        self._data.refresh()
+        return {**self.about(key), "saved": report}
+
+    def image(self, key: str) -> Response:
+        """PNG of the usual depth of a session; with ?of=recording, of its recording.
+
+        Raises:
+            LiexError: there is no such recording, or it cannot be read.
+        """
+        session = self._session(key)
+        whole = session is None or request.args.get("of") == "recording"
+        depth = self._whole(key)[0] if whole else self._usual(session)
+        return Response(png(_shaded(depth)), mimetype="image/png")
+
+    def scene(self, key: str) -> Response:
+        """SVG of the usual depth of a session with its scene.
+
+        Raises:
+            SessionError: there is no such session.
+        """
+        session = self._data.session(key)
+        return Response(scene_svg(session, self._usual(session)), mimetype="image/svg+xml")
+
+    def _session(self, key: str) -> Session | None:
         """The results of the recording `key`; None if absent."""
         if key not in self._data.entries:
             raise SessionError(f"there is no recording '{key}'; see the list of sessions")
         return self._data.session(key) if key in {one.key for one in self._data.done} else None
 
-    def about(self, key: str) -> dict[str, Any]:
-        """Facts for the page: image size, marks, and where a region can be saved."""
-        session = self.session(key)
-        told: dict[str, Any] = {"may_save": self._regions is not None, "places": [], "region": None}
-        if self._regions is not None:
-            told |= self._regions.about(key, session)
-        if session is None:
-            _, camera = self._whole(key)
-            marks: list[Mark] = []
-        else:
-            camera = session.camera
-            marks = scene_marks(session)
-        found = [{"kind": one.kind, "said": one.said, "points": _rounded(one)} for one in marks]
-        size = {"width": camera.width, "height": camera.height}
-        return {**told, **size, "measured": session is not None, "marks": found}
-
-    def save(self, key: str, asked: dict[str, Any]) -> dict[str, Any]:
-        """Check and save the requested region; returns the page's new facts."""
-        if self._regions is None:
-            raise PlanError("no region is saved here")
-        corners = asked.get("corners")
-        place = str(asked.get("place"))[:40]
-        session = self.session(key)
-        said = self._regions.save(key, session, place, corners, asked.get("was"))
-        self._data.refresh()
-        return {**self.about(key), "saved": said}
-
-    def picture(self, key: str, of: str) -> NDArray[np.uint16]:
-        """(H, W) uint16 mm: the usual depth of the session, or of its recording."""
-        session = self.session(key)
-        return self._whole(key)[0] if session is None or of == "recording" else self.usual(key)
-
-    def usual(self, key: str) -> NDArray[np.uint16]:
+    def _usual(self, session: Session) -> NDArray[np.uint16]:
         """(H, W) uint16 mm: the usual depth of the session's frames."""
-        session = self._data.session(key)
         n = len(session.frames)
-        rows = np.unique(np.linspace(0, n - 1, min(n, _N_PICTURES)).astype(int))
-        found = [self._frames.depth(key, session, int(row)) for row in rows]
-        kept = [one for one in found if one is not None]
-        camera = session.camera
-        return usual_depth(
-            np.stack(kept) if kept else np.zeros((1, camera.height, camera.width), np.uint16)
-        )
+        rows = np.unique(np.linspace(0, n - 1, min(n, _N_FRAMES)).astype(int))
+        depths = [self._images.depth(session, int(row)) for row in rows]
+        empty = np.zeros((session.camera.height, session.camera.width), np.uint16)
+        return usual_depth(np.stack([one for one in depths if one is not None] or [empty]))
 
-    def _whole(self, key: str) -> tuple[NDArray[np.uint16], Any]:
+    def _whole(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         if self._regions is None:
-            raise SessionError(f"{key} was not measured yet, so there is no picture of it")
+            raise SessionError(f"{key} was not measured yet, so there is no image of it")
         return self._regions.picture(key)
-
-
-def add_scenes(server: Flask, data: StudyData, frames: Frames, regions: Regions | None) -> None:
-    """Add the routes of scenes and regions; they are protected by the server's guard.
-
-    Without `regions`, no region can be saved.
-    """
-    scenes = _Scenes(data, frames, regions)
-
-    def told(make: Callable[[], Any]) -> Response:
-        """JSON of the result of `make`, or status 400 with a message."""
-        try:
-            return jsonify(make())
-        except LiexError as error:
-            answer = jsonify({"said": str(error)})
-            answer.status_code = 400
-            return answer
-
-    def drawn(make: Callable[[], str | bytes], kind: str) -> Response:
-        """The image that `make` returns, or status 400 with a message."""
-        try:
-            return Response(make(), mimetype=kind)
-        except LiexError as error:
-            return Response(str(error), 400, mimetype="text/plain")
-
-    @server.get("/region/<path:key>/about")
-    def region_about(key: str) -> Response:
-        """Facts about the recording `key`."""
-        return told(lambda: scenes.about(key))
-
-    @server.get("/region/<path:key>/picture.png")
-    def region_picture(key: str) -> Response:
-        """The whole depth image of `key`; with ?of=recording, the depth image of its recording."""
-        of = request.args.get("of", "")
-        return drawn(lambda: _png(scenes.picture(key, of)), "image/png")
-
-    @server.get("/region/<path:key>/scene.svg")
-    def region_scene(key: str) -> Response:
-        """The depth image of the session `key` with its scene."""
-        return drawn(lambda: scene_svg(data.session(key), scenes.usual(key)), "image/svg+xml")
-
-    @server.post("/region/<path:key>/save")
-    def region_save(key: str) -> Response:
-        """Save a region of the recording `key`: JSON with place, corners (px) and was."""
-        asked = request.get_json(silent=True)  # another site's form cannot send JSON
-        if regions is None or not isinstance(asked, dict):
-            answer = jsonify({"said": "no region is saved here"})
-            answer.status_code = 403 if regions is None else 400
-            return answer
-        return told(lambda: scenes.save(key, asked))
 
 
 def scene_svg(session: Session, depth: NDArray[np.uint16]) -> str:
@@ -188,16 +163,3 @@ def _shaded(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     read = depth[depth > 0]
     reach = float(np.ptp(np.percentile(read, [3.0, 95.0]))) if len(read) else 0.0
     return shade(depth, max(reach, _LEAST_REACH_MM))
-
-
-def _png(depth: NDArray[np.uint16]) -> bytes:
-    import cv2
-
-    done, png = cv2.imencode(".png", np.ascontiguousarray(_shaded(depth)[..., ::-1]))
-    if not done:
-        raise SessionError("the picture cannot be made")
-    return bytes(png)
-
-
-def _rounded(mark: Mark) -> list[list[float]]:
-    return [[round(float(u), 1), round(float(v), 1)] for u, v in mark.points_px]

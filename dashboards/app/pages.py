@@ -10,12 +10,15 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote, unquote
 
 import numpy as np
+import pandas as pd
 from flask import Flask, Response, jsonify, redirect, render_template, request
 from markupsafe import Markup
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from werkzeug.exceptions import NotFound
 
 from liex_lab.actions.vocabulary import PALETTE, UNLABELLED_COLOUR
@@ -23,7 +26,7 @@ from liex_lab.behaviour import cohort
 from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan.subject import references_first
-from liex_lab.sessions import correcting
+from liex_lab.sessions import Session, correcting
 from liex_lab.sessions.corrections import author_name
 
 from ..figures import groups, sets, times
@@ -38,7 +41,7 @@ from ..figures.style import (
     time_unit,
 )
 from ..report.contact_sheet import WORDS, scene_marks
-from ..report.quality import warnings
+from ..report.facts import warnings
 from ..units import shown, titled
 from . import tables
 from .data import (
@@ -51,18 +54,12 @@ from .data import (
     colours_of,
     raster,
     shown_words,
-    vocabulary_of,
 )
+from .desk import Desks
 from .tables import number, records, session_address
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from liex_lab.sessions import Session
-
-    from .desk import Desks
-
 ShowReplay = Callable[[Path, float], object]
+Span = tuple[float, float]
 _ASSETS = Path(__file__).parent / "assets"
 _COLUMNS = 800  # time bins of an ethogram's row
 _MOST_PARTS = 40_000  # time bins of all rows together
@@ -88,19 +85,10 @@ _FACTS = (
 _MOVED = (("heading_rad", "heading", "rad"), ("length_mm", "length", "mm"))
 
 
-def add_pages(
-    app: Flask,
-    data: StudyData,
-    desks: Desks,
-    show_replay: ShowReplay | None,
-    *,
-    may_correct: bool,
-    of_recordings: bool,
-) -> None:
-    """Add the pages, and the routes that their scripts use.
+class Pages:
+    """The pages of a study, and what their scripts ask for.
 
     Args:
-        app: the dashboard.
         data: the study.
         desks: its sessions.
         show_replay: opens the replay of a .rrd at a time (s); None only shows the command.
@@ -108,19 +96,146 @@ def add_pages(
         of_recordings: whether regions can be drawn for recordings without results.
     """
 
-    def table(name: str, **how: Any) -> Markup:
+    def __init__(
+        self,
+        data: StudyData,
+        desks: Desks,
+        show_replay: ShowReplay | None,
+        may_correct: bool,
+        of_recordings: bool,
+    ) -> None:
+        self.data = data
+        self._desks = desks
+        self._show_replay = show_replay
+        self._may_correct = may_correct
+        self._of_recordings = of_recordings
+
+    def table(self, name: str, **how: Any) -> Markup:
+        """A table as HTML, by its name; see `tables.find` and `tables.fill`."""
         try:
-            filled = tables.fill(tables.find(data, name), **how)
+            filled = tables.fill(tables.find(self.data, name), **how)
         except LiexError as error:
             filled = {"sentence": str(error)}
         return Markup(render_template("table.html", **filled))  # nosec B704: a rendered template
+
+    def requested_table(self) -> Markup:
+        """The table ?name=, filtered and sorted."""
+        asked = {key: request.args.get(key, "") for key in ("name", "words", "column")}
+        name, words, column = asked.values()
+        return self.table(name, words=words, sorted_by=column, down=request.args.get("down") == "1")
+
+    def sessions(self) -> str:
+        """The list of sessions."""
+        states = [entry.state for entry in self.data.entries.values()]
+        counts = [
+            (state, title, f"{states.count(state):,}")
+            for state, title in tables.STATES.items()
+            if state in states
+        ]
+        return render_template("sessions.html", counts=counts)
+
+    def refresh(self) -> Any:
+        """Read the states of the sessions again."""
+        self.data.refresh()
+        return redirect("/", 303)
+
+    def ethograms(self) -> str:
+        """The ethograms of the requested sessions."""
+        return render_template("ethograms.html", **ethogram_rows(self.data))
+
+    def groups(self) -> str:
+        """The comparison of groups."""
+        return render_template("groups.html", **compared_groups(self.data))
+
+    def group_figure(self, measure: str) -> Response:
+        """SVG of the comparison of a measure."""
+        with drawing():
+            return _download(_comparison(self.data, measure, request.args.get("reference", "")))
+
+    def review(self) -> str:
+        """The page of blinded reviews."""
+        return render_template("review.html")
+
+    def arena(self, key: str) -> str:
+        """The page on which a region is drawn."""
+        return render_template("arena.html", key=key, known=key in self.data.entries)
+
+    def session(self, key: str) -> Any:
+        """A session, or why it has no results."""
+        entry = self.data.entries.get(key)
+        if entry is None:
+            reason = "The study has no session of this name."
+            return render_template("sentence.html", title="No such session", said=reason), 404
+        if entry not in self.data.done:
+            reason = "; ".join(filter(None, (entry.reason, entry.remedy)))
+            more = {"arena": f"/arena/{quote(key, safe='')}"} if self._of_recordings else {}
+            what = {"kind": "session", "title": key, "state": entry.state}
+            reason = reason or "it has not been measured yet"
+            return render_template("sentence.html", said=reason, **what, **more)
+        return render_template(
+            "session.html",
+            **session_facts(self.data, key),
+            at_s=_moment(),
+            steps=_STEPS,
+            may_show=self._show_replay is not None,
+            sentences=correcting.SENTENCES if self._may_correct else (),
+            modules=sorted(path.name for path in _ASSETS.glob("desk*.mjs")),
+        )
+
+    def whole(self, key: str) -> Response:
+        """The ethogram and the curves of a session, or of its stretch from ?from= to ?to= (s)."""
+        animals = self._desks.of(key).animals
+        span = _span(animals[0].duration_s)
+        part = span if "from" in request.args else None
+        with drawing():
+            drawn = [draw(one, part) for one in animals for draw in (times.ethogram, times.curves)]
+            return _timed("whole", drawn, span, TWO_COLUMNS_MM)
+
+    def moment(self, key: str) -> Response:
+        """The curves around ?t= (s), the values of its frame, and the command of its replay."""
+        at_s = _moment()
+        span = (at_s - _HALF_S, at_s + _HALF_S)
+        with drawing():
+            figure = times.curves(self._desks.of(key).animals[0], span, _AROUND_MM)
+            values = self.data.read(key, lambda session: facts(session, at_s))
+            path = self.data.session(key).path
+            command = f"liex show {shlex.quote(str(path))} --at {at_s:.3f}"
+            return _timed("around", [figure], span, _AROUND_MM, facts=values, command=command)
+
+    def step(self, key: str) -> Response:
+        """The time of the next or previous (?to=) frame, bout or flag (?by=) from ?t= (s)."""
+        to = 1 if request.args.get("to") == "1" else -1
+        at_s = moved_to(self.data.session(key), _moment(), request.args.get("by", ""), to)
+        return jsonify(round(at_s, 4))
+
+    def replay(self, key: str) -> Any:
+        """Open the replay of a session at a moment."""
+        asked = request.get_json(silent=True)  # a form of another site cannot send JSON
+        at_s = asked.get("at_s") if isinstance(asked, dict) else None
+        if self._show_replay is None or not isinstance(at_s, int | float):
+            return {"said": "no replay is opened here"}, 403
+        self._show_replay(self.data.session(key).path / "session.rrd", float(at_s))
+        return {"said": f"Rerun shows the replay at {at_s:.3f} s."}
+
+    def figure(self, key: str, name: str) -> Response:
+        """SVG of a figure of a session."""
+        if name not in sets.OF_SESSION:
+            raise NotFound
+        with drawing():
+            _, _, drawn = next(sets.session_figures(self.data.session(key), [name]))
+            return _download(drawn)
+
+
+def add_handlers(app: Flask, pages: Pages) -> None:
+    """Add what all pages share: the variables of their templates, and answers to errors."""
 
     @app.context_processor
     def shared() -> dict[str, Any]:
         path = request.path
         here = "/" if path.startswith(("/session", "/arena")) else path
         functions = {"csv_address": tables.csv_address, "session_address": session_address}
-        return {"study": data.name, "here": here, "grey": GREY, "table": table, **functions}
+        names = {"study": pages.data.name, "here": here, "grey": GREY, "table": pages.table}
+        return {**names, **functions}
 
     @app.errorhandler(LiexError)
     def refused(error: LiexError) -> Any:
@@ -132,134 +247,20 @@ def add_pages(
     def absent(_: NotFound) -> Any:
         return render_template("sentence.html", title="No such page", said=""), 404
 
-    @app.get("/")
-    def sessions_page() -> str:
-        states = [entry.state for entry in data.entries.values()]
-        counts = [
-            (state, title, f"{states.count(state):,}")
-            for state, title in tables.STATES.items()
-            if state in states
-        ]
-        return render_template("sessions.html", counts=counts)
-
-    @app.post("/refresh")
-    def refresh() -> Any:
-        data.refresh()
-        return redirect("/", 303)
-
-    @app.get("/table")
-    def table_rows() -> Markup:
-        asked = request.args
-        return table(
-            asked.get("name", ""),
-            words=asked.get("words", ""),
-            sorted_by=asked.get("column", ""),
-            down=asked.get("down") == "1",
-        )
-
-    @app.get("/ethograms")
-    def ethograms_page() -> str:
-        return render_template("ethograms.html", **ethogram_rows(data))
-
-    @app.get("/groups")
-    def groups_page() -> str:
-        return render_template("groups.html", **compared_groups(data))
-
-    @app.get("/group-figure/<path:measure>.svg")
-    def group_figure(measure: str) -> Response:
-        with drawing():
-            figure = _comparison(data, measure, request.args.get("reference", ""))
-            return _download(None if figure is None else image_bytes(figure, "svg"))
-
-    @app.get("/review")
-    def review_page() -> str:
-        return render_template("review.html")
-
-    @app.get("/arena/<path:key>")
-    def arena_page(key: str) -> str:
-        return render_template("arena.html", key=key, known=key in data.entries)
-
-    @app.get("/session/<path:key>")
-    def session_page(key: str) -> Any:
-        entry = data.entries.get(key)
-        if entry is None:
-            said = "The study has no session of this name."
-            return render_template("sentence.html", title="No such session", said=said), 404
-        if entry not in data.done:
-            said = "; ".join(filter(None, (entry.reason, entry.remedy)))
-            more = {"arena": f"/arena/{quote(key, safe='')}"} if of_recordings else {}
-            said = said or "it has not been measured yet"
-            what = {"kind": "session", "title": key, "state": entry.state, "said": said}
-            return render_template("sentence.html", **what, **more)
-        return render_template(
-            "session.html",
-            **session_facts(data, key),
-            at_s=_moment(),
-            steps=_STEPS,
-            may_show=show_replay is not None,
-            sentences=correcting.SENTENCES if may_correct else (),
-            modules=sorted(path.name for path in _ASSETS.glob("desk*.mjs")),
-        )
-
-    @app.get("/whole/<path:key>")
-    def whole(key: str) -> Response:
-        """The ethogram and the curves of a session, or of its stretch from ?from= to ?to= (s)."""
-        seen = desks.of(key).seen
-        span = _span(seen[0].duration_s)
-        part = span if "from" in request.args else None
-        with drawing():
-            drawn = [draw(one, part) for one in seen for draw in (times.ethogram, times.curves)]
-            figures = [figure for figure in drawn if figure is not None]
-            return _timed("whole", figures, span, TWO_COLUMNS_MM)
-
-    @app.get("/moment/<path:key>")
-    def moment(key: str) -> Response:
-        """The curves around ?t= (s), the values of its frame, and the command of its replay."""
-        at_s = _moment()
-        span = (at_s - _HALF_S, at_s + _HALF_S)
-        with drawing():
-            figure = times.curves(desks.of(key).seen[0], span, _AROUND_MM)
-            more = data.read(
-                key,
-                lambda session: {
-                    "facts": facts(session, nearest_row(session, at_s)),
-                    "command": f"liex show {shlex.quote(str(session.path))} --at {at_s:.3f}",
-                },
-            )
-            figures = [] if figure is None else [figure]
-            return _timed("around", figures, span, _AROUND_MM, **more)
-
-    @app.get("/step/<path:key>")
-    def step(key: str) -> Response:
-        to = 1 if request.args.get("to") == "1" else -1
-        session = data.session(key)
-        return jsonify(round(moved_to(session, _moment(), request.args.get("by", ""), to), 4))
-
-    @app.post("/replay/<path:key>")
-    def replay(key: str) -> Any:
-        asked = request.get_json(silent=True)  # a form of another site cannot send JSON
-        at_s = asked.get("at_s") if isinstance(asked, dict) else None
-        if show_replay is None or not isinstance(at_s, int | float):
-            return {"said": "no replay is opened here"}, 403
-        show_replay(data.session(key).path / "session.rrd", float(at_s))
-        return {"said": f"Rerun shows the replay at {at_s:.3f} s."}
-
-    @app.get("/figure/<path:key>/<name>.svg")
-    def figure(key: str, name: str) -> Response:
-        if name not in sets.OF_SESSION:
-            raise NotFound
-        with drawing():
-            drawn = next(sets.session_figures(data.session(key), [name])).figure
-            return _download(None if drawn is None else image_bytes(drawn, "svg"))
-
 
 def ethogram_rows(data: StudyData) -> dict[str, Any]:
     """The variables of the ethogram page, for the requested groups and sessions."""
     names = request.args.getlist("group")
     chosen = request.args.getlist("session")
-    ones = data.ethograms(chosen_keys(data, names, chosen))
+    group_of = {entry.key: entry.who.get("group", "") for entry in data.done}
+    keys = [key for key in group_of if key in chosen]  # sessions take precedence over groups
+    if not chosen:
+        within = [key for key, group in group_of.items() if not names or group in names]
+        keys = sorted(within, key=lambda key: group_of[key])
+    ones = data.ethograms(keys)
     words = shown_words(ones.values())
-    coloured = colours_of(words[: len(PALETTE)], vocabulary_of(ones.values()))
+    vocabulary = dict.fromkeys(word for one in ones.values() for word in one.vocabulary)
+    coloured = colours_of(words[: len(PALETTE)], list(vocabulary))
     colours = {**coloured, "unlabelled": UNLABELLED_COLOUR, NO_POSE: NO_POSE_COLOUR}
     if len(words) > len(PALETTE):
         colours[OTHER] = GREY
@@ -267,21 +268,16 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
     unit, size = time_unit(stop_s - start_s)
     summaries = data.collected().set_index("key")
     entries: list[dict[str, Any]] = []
-    before = None
-    for key, one in ones.items():
-        group = data.entries[key].who.get("group", "")
-        entries.append(
-            {
-                "key": key,
-                "group": group if group != before else "",
-                "bars": _bars(one, words, (start_s, stop_s), len(ones), (unit, size)),
-                "shares": _shares(summaries.loc[[key]].iloc[0], [*words, "unlabelled"], coloured),
-            }
-        )
-        before = group
-    groups_there = sorted({entry.who.get("group", "") for entry in data.done} - {""})
-    keys = [entry.key for entry in data.done]
-    choices = [("group", "Groups", groups_there, names), ("session", "Sessions", keys, chosen)]
+    for (key, one), before in zip(ones.items(), [None, *ones], strict=False):
+        repeated = before is not None and group_of[before] == group_of[key]
+        shares = _shares(summaries.loc[[key]].iloc[0], [*words, "unlabelled"], coloured)
+        bars = _bars(one, words, (start_s, stop_s), len(ones), (unit, size))
+        group = "" if repeated else group_of[key]
+        entries.append({"key": key, "group": group, "bars": bars, "shares": shares})
+    choices = [
+        ("group", "Groups", sorted({*group_of.values()} - {""}), names),
+        ("session", "Sessions", list(group_of), chosen),
+    ]
     return {
         "choices": choices,
         "legend": colours,
@@ -295,24 +291,10 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
     }
 
 
-def chosen_keys(data: StudyData, names: Sequence[str], sessions: Sequence[str]) -> list[str]:
-    """Keys of the requested sessions, else of the sessions of the requested groups, by group.
-
-    Args:
-        data: the study.
-        names: names of groups; empty means all.
-        sessions: names of sessions, which take precedence over groups.
-    """
-    if sessions:
-        return [entry.key for entry in data.done if entry.key in set(sessions)]
-    within = [entry for entry in data.done if not names or entry.who.get("group", "") in names]
-    return [entry.key for entry in sorted(within, key=lambda entry: entry.who.get("group", ""))]
-
-
 def _bars(
     one: Ethogram,
     words: Sequence[str],
-    span_s: tuple[float, float],
+    span_s: Span,
     n_rows: int,
     unit: tuple[str, float],
 ) -> list[dict[str, Any]]:
@@ -327,8 +309,9 @@ def _bars(
     for a, b in pairwise(edges):
         word = named[codes[a]] if b > a else ""
         at = (start_s + a * (stop_s - start_s) / n) / unit[1]
-        said = f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}"
-        bars.append({"at": 100.0 * a / n, "width": 100.0 * (b - a) / n, "word": word, "said": said})
+        label = f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}"
+        part = {"at": 100.0 * a / n, "width": 100.0 * (b - a) / n, "word": word, "said": label}
+        bars.append(part)
     return bars
 
 
@@ -336,9 +319,9 @@ def _shares(
     row: pd.Series[float], words: Sequence[str], coloured: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """One row of the time budget, in %; actions without their own colour are merged."""
-    shares = {word: float(row.get(f"{word}_share", np.nan)) for word in words}
     parts: dict[str, float] = {}
-    for word, share in shares.items():
+    for word in words:
+        share = float(row.get(f"{word}_share", np.nan))
         if share > 0.0:  # NaN if unknown
             name = word if word in coloured or word == "unlabelled" else OTHER
             parts[name] = parts.get(name, 0.0) + 100.0 * share
@@ -351,8 +334,6 @@ def _shares(
 
 def _ticks(low: float, high: float) -> list[tuple[float, str]]:
     """Round numbers of an axis, each with its position in %."""
-    from matplotlib.ticker import MaxNLocator
-
     ticks = MaxNLocator(8, steps=[1, 2, 5, 10]).tick_values(low, high)
     inside = [tick for tick in ticks if low <= tick <= high]
     return [(100.0 * (tick - low) / max(high - low, 1e-9), f"{tick:g}") for tick in inside]
@@ -364,17 +345,16 @@ def compared_groups(data: StudyData) -> dict[str, Any]:
     measures = list(tables.columns_of(data))
     usual = [name for name in cohort.usual_measures(table) if name in measures]
     ordered = [*usual, *(name for name in measures if name not in usual)]
-    units = data.units()
     names = references_first({str(name) for name in table["group"].fillna("")} - {""})
     if not ordered or len(names) < 2:
         return {"refused": f"{len(table)} measured sessions have {', '.join(names) or 'no group'}"}
-    measure = request.args.get("measure", "")
-    measure = measure if measure in ordered else ordered[0]
-    reference = request.args.get("reference", "")
-    reference = reference if reference in names else ""
+    asked = {key: request.args.get(key, "") for key in ("measure", "reference")}
+    measure = asked["measure"] if asked["measure"] in ordered else ordered[0]
+    reference = asked["reference"] if asked["reference"] in names else ""
+    units, notes = data.units(), list(table.attrs.get("check", ()))
     unit, meaning = data.described(measure)
     page: dict[str, Any] = {
-        "notes": data.to_check(),
+        "notes": notes,
         "measures": [(name, titled(name, units.get(name, ""))) for name in ordered],
         "names": names,
         "measure": measure,
@@ -389,28 +369,25 @@ def compared_groups(data: StudyData) -> dict[str, Any]:
     with drawing():
         drawn = _comparison(data, measure, reference)
         svg = "" if drawn is None else on_page(image_bytes(drawn, "svg"), "groups", measure)
-    own = records(stats[stats["measure"] == measure])
-    return page | {
-        "figure": Markup(_titled_links(svg)),  # nosec B704: matplotlib escapes every text
-        "verdicts": [_verdict(row, unit) for row in own],
-        "methods": cohort.methods(stats, table, [f"{note}." for note in data.to_check()]),
-    }
-
-
-def _comparison(data: StudyData, measure: str, reference: str) -> Any:
-    """The figure of a measure by group; its marks link to their sessions."""
-    stats = data.stats(measure, reference or None)
-    unit, _ = data.described(measure)
-    return groups.comparison(data.collected(), stats, measure, unit, link=session_address)
-
-
-def _titled_links(svg: str) -> str:
-    """A figure's links for the page: the part after the # becomes the tooltip."""
-    return re.sub(
+    # of the figure's links, the part after the # becomes the tooltip
+    linked = re.sub(
         r'<a href="(/session/[^"#]*)#([^"]*)"([^>]*)>',
         lambda found: f'<a href="{found[1]}"><title>{Markup.escape(unquote(found[2]))}</title>',
         svg,
     )
+    own = records(stats[stats["measure"] == measure])
+    return page | {
+        "figure": Markup(linked),  # nosec B704: matplotlib escapes every text
+        "verdicts": [_verdict(row, unit) for row in own],
+        "methods": cohort.methods(stats, table, [f"{note}." for note in notes]),
+    }
+
+
+def _comparison(data: StudyData, measure: str, reference: str) -> Figure | None:
+    """The figure of a measure by group; its marks link to their sessions."""
+    stats = data.stats(measure, reference or None)
+    unit, _ = data.described(measure)
+    return groups.comparison(data.collected(), stats, measure, unit, link=session_address)
 
 
 def _verdict(row: dict[str, Any], unit: str) -> dict[str, Any]:
@@ -435,7 +412,7 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
     session = data.session(key)
     who = data.entries[key].who
     frames = session.metadata["frames"]
-    said = [f"{name.replace('_', ' ')} {value}" for name, value in who.items() if value]
+    stated = [f"{name.replace('_', ' ')} {value}" for name, value in who.items() if value]
     extent = f"{frames['n_frames']:,} frames, {frames['duration_s']:.1f} s"
     path = quote(key, safe="")
     kinds = dict.fromkeys(mark.kind for mark in scene_marks(session))
@@ -447,7 +424,7 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
     return {
         "key": key,
         "group": who.get("group", ""),
-        "headline": f"{', '.join(said)} · {extent}" if said else extent,
+        "headline": f"{', '.join(stated)} · {extent}" if stated else extent,
         "warnings": warnings(session),
         "author": author_name(),
         "scene": [(kind, WORDS[kind]) for kind in kinds],
@@ -455,11 +432,6 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
         "report": f"/report/{path}" if session.has("report.html") else "",
         "files": files,
     }
-
-
-def nearest_row(session: Session, at_s: float) -> int:
-    """Row of the frame nearest in time to `at_s` (s since the first frame)."""
-    return int(np.abs(session.frames["time_s"].to_numpy(float) - at_s).argmin())
 
 
 def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
@@ -473,8 +445,8 @@ def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
     """
     time_s = session.frames["time_s"].to_numpy(float)
     if by == "frame":
-        row = nearest_row(session, at_s) + to
-        return float(time_s[min(max(row, 0), len(time_s) - 1)])
+        row = np.abs(time_s - at_s).argmin() + to
+        return float(time_s[np.clip(row, 0, len(time_s) - 1)])
     places = (
         session.bouts["start_s"].to_numpy(float)
         if by == "bout"
@@ -484,21 +456,15 @@ def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
     return at_s if not len(beyond) else float(beyond.min() if to > 0 else beyond.max())
 
 
-def facts(session: Session, row: int) -> list[tuple[str, str]]:
-    """The values of one frame as (name, value with unit).
-
-    Args:
-        session: the opened session.
-        row: the frame's row in the table `frames`.
-    """
+def facts(session: Session, at_s: float) -> list[tuple[str, str]]:
+    """The values of the frame nearest in time to `at_s` (s), as (name, value with unit)."""
+    row = int(np.abs(session.frames["time_s"].to_numpy(float) - at_s).argmin())
     frame = session.frames.iloc[row]
     found = [(title, frame[name], unit) for name, title, unit in _FACTS if name in frame]
     if session.has("kinematics.parquet"):
         moved = session.kinematics.iloc[row]
-        measured = [
-            (one.column, one.title.lower(), one.unit)
-            for one in logged_of(session.metadata["animal"])
-        ]
+        curves = logged_of(session.metadata["animal"])
+        measured = [(one.column, one.title.lower(), one.unit) for one in curves]
         found += [
             (title, *shown(moved[name], unit))
             for name, title, unit in (*measured, *_MOVED)
@@ -516,9 +482,10 @@ def facts(session: Session, row: int) -> list[tuple[str, str]]:
 
 
 def _timed(
-    name: str, figures: Sequence[Any], span_s: tuple[float, float], width_mm: float, **more: Any
+    name: str, drawn: Sequence[Figure | None], span_s: Span, width_mm: float, **more: Any
 ) -> Response:
     """Figures over time as JSON: SVG, and the start and end of the time axis in the figure."""
+    figures = [figure for figure in drawn if figure is not None]
     svgs = [
         on_page(image_bytes(one, "svg"), f"{name}{k}", "over time") for k, one in enumerate(figures)
     ]
@@ -531,10 +498,10 @@ def _timed(
     return jsonify({"svg": "".join(svgs), **axis, **more})
 
 
-def _download(svg: bytes | None) -> Response:
-    if svg is None:
+def _download(figure: Figure | None) -> Response:
+    if figure is None:
         raise SessionError("there is nothing to draw: no value is known")
-    return Response(svg, mimetype="image/svg+xml")
+    return Response(image_bytes(figure, "svg"), mimetype="image/svg+xml")
 
 
 def _moment() -> float:
@@ -546,7 +513,7 @@ def _moment() -> float:
     return at_s if 0.0 <= at_s < 1e9 else 0.0
 
 
-def _span(duration_s: float) -> tuple[float, float]:
+def _span(duration_s: float) -> Span:
     """The requested stretch from ?from= to ?to= (s); the whole duration if absent or invalid."""
     stop_s = max(duration_s, 1e-3)
     try:

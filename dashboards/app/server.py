@@ -1,38 +1,55 @@
 """`liex dashboard`: a study in the browser, a Flask app served from this machine by waitress.
 
-The content security policy allows no other source than this server.
+Only requests with the token are answered (host and origin check, token cookie), and pages load
+nothing from other sites (content security policy). An internal error gives one line on the terminal
+and a message for the visitor.
 """
 
 from __future__ import annotations
 
+import hmac
 import logging
+import re
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode, urlsplit
 
-from flask import Flask
+import pandas as pd
+from flask import Flask, Response, abort, redirect, request, stream_with_context
 from jinja2 import StrictUndefined
 from waitress.server import create_server
+from werkzeug.exceptions import HTTPException
 
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, printable
 from liex_lab.runtime.processes import Ended
 
-from . import page_region, page_review, pages
+from ..figures.animals import DepthImages
+from . import corrections, page_region, page_review, pages, tables
 from .data import StudyData
 from .desk import Desks, Suggest
-from .desk_routes import Clerk, add_routes
-from .frames import Frames
-from .guard import LOOPBACK, MOST_BYTES, add_downloads, guard
-from .saver import Correct, Report, Saver
 
+Views = dict[str, Callable[..., Any]]
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+MOST_BYTES = 4 << 20  # of a request's body; a correction has a few hundred bytes
 _SAVER = "liex_saver"
 _IDLE_S = 30  # browsers open connections before they need them; an idle one is closed
 _CONNECTIONS = 256  # open at the same time; a browser opens six
 _THREADS = 12
 # addresses to listen on that a browser cannot open
 _EVERYWHERE = ("", "0.0.0.0", "::")  # nosec B104: only compared with
+_COOKIE = "liex_dashboard"
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: "
+    "blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'"
+)
+# a report needs no script
+_REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def make_app(
@@ -41,8 +58,8 @@ def make_app(
     token: str = "",
     alone: bool = True,
     show_replay: pages.ShowReplay | None = None,
-    correct: Correct | None = None,
-    report: Report | None = None,
+    correct: corrections.Correct | None = None,
+    report: corrections.Report | None = None,
     suggest: Suggest | None = None,
     reviews: Path | None = None,
     regions: page_region.Regions | None = None,
@@ -72,34 +89,90 @@ def make_app(
     app.jinja_env.undefined = StrictUndefined
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
     guard(app, token, alone=alone)
-    frames = Frames()
-    desks = Desks(data.session, frames, suggest)
-    saver = Saver(correct, report) if correct is not None else None
+    images = DepthImages()
+    desks = Desks(data.session, images, suggest)
+    saver = corrections.Saver(correct, report) if correct is not None else None
     app.extensions[_SAVER] = saver
-    pages.add_pages(
-        app,
-        data,
-        desks,
-        show_replay,
-        may_correct=saver is not None,
-        of_recordings=regions is not None and regions.of_recordings,
-    )
-    add_downloads(app, data)
-    add_routes(app, desks, None if saver is None else Clerk(desks, saver))
-    page_region.add_scenes(app, data, frames, regions)
+    of_recordings = regions is not None and regions.of_recordings
+    shown = pages.Pages(data, desks, show_replay, saver is not None, of_recordings)
+    pages.add_handlers(app, shown)
+    scenes = page_region.Scenes(data, images, regions)
+    views = _views(shown, corrections.Clerk(desks, saver), desks, scenes, Downloads(data))
     if reviews is not None:
-        page_review.add_reviews(app, page_review.Reviews(data, desks, reviews))
+        views |= _review_views(page_review.Reviews(data, desks, reviews))
+    for rule, view in views.items():
+        method, path = rule.split(" ")
+        app.add_url_rule(path, rule.replace(".", "-"), view, methods=[method])
     return app
 
 
-def serve(app: Flask, host: str, port: int, told: Callable[[int], None]) -> None:
+def _views(
+    shown: pages.Pages,
+    clerk: corrections.Clerk,
+    desks: Desks,
+    scenes: page_region.Scenes,
+    downloads: Downloads,
+) -> Views:
+    """Every address of the dashboard, and what answers it."""
+    return {
+        "GET /": shown.sessions,
+        "POST /refresh": shown.refresh,
+        "GET /table": shown.requested_table,
+        "GET /ethograms": shown.ethograms,
+        "GET /groups": shown.groups,
+        "GET /group-figure/<path:measure>.svg": shown.group_figure,
+        "GET /review": shown.review,
+        "GET /arena/<path:key>": shown.arena,
+        "GET /session/<path:key>": shown.session,
+        "GET /whole/<path:key>": shown.whole,
+        "GET /moment/<path:key>": shown.moment,
+        "GET /step/<path:key>": shown.step,
+        "POST /replay/<path:key>": shown.replay,
+        "GET /figure/<path:key>/<name>.svg": shown.figure,
+        "GET /csv/<path:name>.csv": downloads.table,
+        "GET /session-csv/<path:key>/<name>.csv": downloads.session_table,
+        "GET /report/<path:key>": downloads.report,
+        "GET /desk/<path:key>/about": clerk.about,
+        "GET /desk/<path:key>/times": clerk.times,
+        "GET /desk/<path:key>/rows/<int:first>/<int:stop>": lambda key, first, stop: desks.of(
+            key
+        ).rows(first, stop),
+        "GET /desk/<path:key>/bouts": lambda key: desks.of(key).bouts(),
+        "GET /desk/<path:key>/doubts": clerk.doubts,
+        "GET /desk/<path:key>/crossings": lambda key: desks.of(key).crossings(),
+        "GET /desk/<path:key>/frame/<int:row>.png": clerk.frame,
+        "GET /desk/<path:key>/state": clerk.state,
+        "POST /desk/<path:key>/correct": clerk.correct,
+        "GET /region/<path:key>/about": scenes.about,
+        "GET /region/<path:key>/picture.png": scenes.image,
+        "GET /region/<path:key>/scene.svg": scenes.scene,
+        "POST /region/<path:key>/save": scenes.save,
+    }
+
+
+def _review_views(reviews: page_review.Reviews) -> Views:
+    """Every address of the blinded reviews, and what answers it."""
+    clip = "GET /reviews/<path:name>/clip/<int:number>"
+    return {
+        "GET /reviews": reviews.names,
+        "POST /reviews": reviews.begin,
+        "GET /reviews/<path:name>/state": reviews.state,
+        "POST /reviews/<path:name>/answer": reviews.answer,
+        f"{clip}/about": reviews.about,
+        f"{clip}/times": reviews.times,
+        f"{clip}/rows/<int:start>/<int:end>": reviews.rows,
+        f"{clip}/frame/<int:row>.png": reviews.frame,
+    }
+
+
+def serve(app: Flask, host: str, port: int, report: Callable[[int], object]) -> None:
     """Serve until interrupted; requests and corrections in progress are then completed.
 
     Args:
         app: the dashboard.
         host: the address to listen on.
         port: the port; 0 uses any free one.
-        told: called with the port once the server listens.
+        report: called with the port once the server listens.
 
     Raises:
         LiexError: the server cannot listen there.
@@ -127,7 +200,7 @@ def serve(app: Flask, host: str, port: int, told: Callable[[int], None]) -> None
     loop = threading.Thread(target=server.run, daemon=True)
     loop.start()
     try:
-        told(int(server.effective_port))
+        report(int(server.effective_port))
         loop.join()
     except KeyboardInterrupt:
         pass
@@ -136,7 +209,7 @@ def serve(app: Flask, host: str, port: int, told: Callable[[int], None]) -> None
             raise
     finally:
         server.task_dispatcher.shutdown()
-        saver: Saver | None = app.extensions[_SAVER]
+        saver: corrections.Saver | None = app.extensions[_SAVER]
         if saver is not None:
             saver.finish()
 
@@ -155,3 +228,124 @@ def address(host: str, port: int, token: str) -> str:
     return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
         f"?token={token}" if token else ""
     )
+
+
+# Access
+
+
+def guard(server: Flask, token: str, *, alone: bool = True) -> None:
+    """Refuse unauthorised requests, and set the security headers of every response.
+
+    A request without the token is refused, because other accounts of this machine can reach its
+    loopback address. A request from another origin is refused, because it is a form of another site
+    (CSRF). With `alone`, a request to another host name is refused as well (DNS rebinding).
+
+    Args:
+        server: the Flask server of the dashboard.
+        token: required of every visitor; empty requires none.
+        alone: only accept requests from this machine.
+    """
+    server.config["MAX_CONTENT_LENGTH"] = MOST_BYTES
+
+    def refuse(reason: str, status: int) -> None:
+        abort(Response(reason, status, mimetype="text/plain"))
+
+    @server.before_request
+    def allowed() -> Any:
+        """Accept a request, or answer with 401, 403 or the cookie that carries the token."""
+        name = _site(f"//{request.host}", name=True)
+        if alone and name not in LOOPBACK:
+            refuse("This dashboard answers on 127.0.0.1 only.", 403)
+        origin = request.headers.get("Origin")
+        if origin and _site(origin) != request.host:
+            refuse("This dashboard takes no requests from other sites.", 403)
+        if not token:
+            return None
+        # a host may have several dashboards, each with its own token
+        _, _, port = request.host.rpartition(":")
+        cookie = f"{_COOKIE}_{port}" if port.isdigit() else _COOKIE
+        given = request.args.get("token", "")
+        if given and hmac.compare_digest(given.encode(), token.encode()):
+            rest = {name: value for name, value in request.args.items() if name != "token"}
+            answer = redirect(request.path + ("?" + urlencode(rest) if rest else ""))
+            # lax, so that the page written by --open sends the cookie at once
+            answer.set_cookie(cookie, token, httponly=True, samesite="Lax")
+            return answer
+        if not hmac.compare_digest(request.cookies.get(cookie, "").encode(), token.encode()):
+            refuse("Open the address that `liex dashboard` printed, with its token.", 401)
+        return None
+
+    @server.after_request
+    def policies(response: Response) -> Response:
+        """Set the security headers of a `response`; its own content policy is kept."""
+        response.headers.setdefault("Content-Security-Policy", _POLICY)
+        response.headers["X-Content-Type-Options"] = "nosniff"
+        response.headers["Referrer-Policy"] = "no-referrer"
+        return response
+
+    @server.errorhandler(413)
+    def too_large(_: HTTPException) -> Response:
+        """The request is larger than any request of the dashboard's pages."""
+        reason = f"The dashboard takes at most {MOST_BYTES >> 20} MB at a time."
+        return Response(reason, 413, mimetype="text/plain")
+
+    @server.errorhandler(Exception)
+    def fault(error: Exception) -> Any:
+        """A request that no page makes, or an internal error."""
+        if isinstance(error, HTTPException):
+            return error
+        cause = printable(f"{type(error).__name__}: {error}")[:300]
+        where = printable(request.path)[:200]
+        print(f"dashboard: {where} could not be answered ({cause})", file=sys.stderr)
+        reason = "This request cannot be answered; load the page again. The terminal says why."
+        return Response(reason, 500, mimetype="text/plain")
+
+
+def _site(address: str, name: bool = False) -> str | None:
+    """Host and port of an address, or only the host name; None if the address is invalid."""
+    try:
+        found = urlsplit(address)
+        return found.hostname if name else found.netloc
+    except ValueError:
+        return None
+
+
+class Downloads:
+    """Tables as CSV, and sessions' reports."""
+
+    def __init__(self, data: StudyData) -> None:
+        self._data = data
+
+    def table(self, name: str) -> Response:
+        """A table as shown, by its `name`, see `tables.find`."""
+        file = name.replace("/", "_").strip("_")
+        return _csv(lambda: tables.find(self._data, name).rows, file)
+
+    def session_table(self, key: str, name: str) -> Response:
+        """The whole table `name` of the session `key`."""
+        return _csv(lambda: tables.session_table(self._data, key, name), f"{key}_{name}")
+
+    def report(self, key: str) -> Response:
+        """The report of the session `key`; its content policy allows no script."""
+        try:
+            folder = self._data.session(key).path.resolve()
+            file = (folder / "report.html").resolve()
+            if file.parent != folder:  # a link to another folder
+                raise FileNotFoundError(file)
+            page = file.read_text(encoding="utf-8")
+        except (LiexError, OSError, ValueError):
+            return Response("This session has no report.", 404, mimetype="text/plain")
+        answer = Response(page, mimetype="text/html")
+        answer.headers["Content-Security-Policy"] = _REPORT
+        return answer
+
+
+def _csv(find: Callable[[], pd.DataFrame], name: str) -> Response:
+    try:
+        rows = find()
+    except LiexError as error:
+        return Response(str(error), 404, mimetype="text/plain")
+    safe = re.sub(r"[^A-Za-z0-9_-]", "_", name) or "table"
+    answer = Response(stream_with_context(tables.as_csv(rows)), mimetype="text/csv")
+    answer.headers["Content-Disposition"] = f'attachment; filename="{safe}.csv"'
+    return answer

@@ -100,7 +100,7 @@ FLIPS = {
     "start_s": "from, s",
     "stop_s": "to, s",
     "p_flip": "probability",
-    "applied": "put right",
+    "applied": "corrected",
     "source": "by",
 }
 BOUT_UNITS = {"peak_speed_mm_s": "mm/s"}
@@ -154,19 +154,15 @@ def arranged(table: Table, words: str, column: str, down: bool) -> pd.DataFrame:
         down: sort in descending order.
     """
     rows = table.rows
-    wanted = words.lower().split()
-    cells = [rows[name].map(_searched) for name in table.shown if wanted and name in rows]
-    if cells:
-        lines = ("\n".join(line) for line in zip(*cells, strict=True))
+    if wanted := words.lower().split():
+        shown = rows[[name for name in table.shown if name in rows]]
+        # a state is found by its displayed word as well
+        cells = shown.map(lambda value: f"{value} {STATES.get(str(value), '')}".lower())
+        lines = ["\n".join(line) for line in cells.to_numpy()]
         rows = rows[np.array([all(word in line for word in wanted) for line in lines], bool)]
     if column in rows:
         rows = rows.sort_values(column, ascending=not down, kind="stable", na_position="last")
     return rows
-
-
-def _searched(value: Any) -> str:
-    """The searchable text of a cell: its value, and for a state the displayed word."""
-    return f"{value} {STATES.get(str(value), '')}".lower()
 
 
 def csv_address(name: str) -> str:
@@ -196,11 +192,11 @@ def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False)
     ]
     places = {name: _places(table.rows[name]) for name in table.shown if name in table.rows}
     n, total = len(rows), len(table.rows)
-    said = counted(n, "row") if n == total else f"{n:,} of {total:,} rows"
-    said += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
+    extent = counted(n, "row") if n == total else f"{n:,} of {total:,} rows"
+    extent += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
     return {
         "heads": heads,
-        "said": said,
+        "said": extent,
         "rows": [
             [_cell(table, row, column, places.get(column)) for column in table.shown]
             for row in records(rows.head(MOST_ROWS))
@@ -257,16 +253,14 @@ def number(value: Any, places: int | None = None) -> str:
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{value:,}"
-    if isinstance(value, float | np.floating):
-        if not np.isfinite(value):
-            return "–"
-        shown = (
-            0.0 if abs(float(value)) < 1e-12 else float(value)
-        )  # rounding error of a sum that is zero
-        if places is not None:
-            return f"{shown:,.{places}f}"
-        return f"{shown:,.0f}" if abs(shown) >= 1000 or shown == int(shown) else f"{shown:.3g}"
-    return str(value)
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    if not np.isfinite(value):
+        return "–"
+    shown = 0.0 if abs(value) < 1e-12 else float(value)  # rounding error of a sum that is zero
+    whole = abs(shown) >= 1000 or shown == int(shown)
+    style = f",.{places}f" if places is not None else ",.0f" if whole else ".3g"
+    return f"{shown:{style}}"
 
 
 def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
@@ -300,26 +294,22 @@ def _cell(
     if unit := table.units.get(about if column in _ESTIMATES else column, ""):
         value = as_read(value, unit)[0]
     if column == "state":
-        said = state_in_words(str(value), str(row.get("reason", "")))
-        return {"kind": "state", "text": STATES.get(said, said), "to": str(value)}
+        state = state_in_words(str(value), str(row.get("reason", "")))
+        return {"kind": "state", "text": STATES.get(state, state), "to": str(value)}
     if column == "reason" and "remedy" in row:
         texts = (str(row[name]) for name in ("reason", "remedy", "damage"))
-        return {
-            "kind": "said",
-            "text": "; ".join(one for one in texts if one not in ("", "nan", "new")),
-        }
+        value = "; ".join(one for one in texts if one not in ("", "nan", "new"))
+        return {"kind": "said", "text": value}
     if column in _LONG:
         return {"kind": "said", "text": str(value)}
-    known = (
-        f"{100 * value:.1f} %"
-        if column.endswith("_share") and isinstance(value, int | float) and np.isfinite(value)
-        else number(value, places)
-    )
+    text = number(value, places)
+    if column.endswith("_share") and isinstance(value, int | float) and np.isfinite(value):
+        text = f"{100 * value:.1f} %"
     if column == table.link and column == "start_s":
-        return {"kind": "moment", "text": known, "to": round(float(value), 4)}
+        return {"kind": "moment", "text": text, "to": round(float(value), 4)}
     if column == table.link and row.get("state", "done") in DONE:
-        return {"kind": "link", "text": known, "to": session_address(str(value))}
-    return {"kind": "", "text": known}
+        return {"kind": "link", "text": text, "to": session_address(str(value))}
+    return {"kind": "", "text": text}
 
 
 def columns_of(data: StudyData) -> Sequence[str]:

@@ -7,21 +7,23 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from liex_lab.actions.vocabulary import action_colours
 from liex_lab.behaviour.activity import Occupancy, occupancy
 from liex_lab.behaviour.cohort import counted_units
 from liex_lab.behaviour.statistics import animal_means
 from liex_lab.plan.subject import references_first
+from liex_lab.sessions import Session
 
 from ..units import counted, read_as, shown, titled
+from .animals import Array, SessionAnimal
 from .places import aligned, extent_mm, occupancy_panels
-from .seen import Array, Seen
 from .style import (
     GROUP_COLOURS,
     GROUP_MARKS,
@@ -30,37 +32,35 @@ from .style import (
     LINE,
     MUTED,
     ONE_COLUMN_MM,
-    PAPER,
     RIGHT_MM,
     TWO_COLUMNS_MM,
     action_key,
+    draw_spans,
     heading,
     key_rows,
+    name_rows,
     panel,
     sheet,
     time_unit,
 )
-from .times import joined, walked
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from liex_lab.sessions import Session
+from .times import walked
 
 NO_GROUP = "no group"
+Grouped = dict[str, dict[str, list[SessionAnimal]]]  # group -> subject -> its sessions
 
 
-def by_group(all_seen: Sequence[Seen]) -> dict[str, dict[str, list[Seen]]]:
+def by_group(animals: Sequence[SessionAnimal]) -> Grouped:
     """The sessions of each subject of each group, groups in the given order, subjects by name.
 
     Args:
-        all_seen: animals of sessions, those of the reference group first; one without a subject's
+        animals: animals of sessions, those of the reference group first; one without a subject's
             name is its own subject.
     """
-    out: dict[str, dict[str, list[Seen]]] = {seen.group or NO_GROUP: {} for seen in all_seen}
-    for seen in sorted(all_seen, key=lambda one: one.who):
-        out[seen.group or NO_GROUP].setdefault(seen.who, []).append(seen)
+    out: dict[str, dict[str, list[SessionAnimal]]] = {
+        animal.group or NO_GROUP: {} for animal in animals
+    }
+    for animal in sorted(animals, key=lambda one: one.who):
+        out[animal.group or NO_GROUP].setdefault(animal.who, []).append(animal)
     return out
 
 
@@ -69,19 +69,19 @@ def group_colour(name: str, names: Sequence[str]) -> str:
     return GROUP_COLOURS[names.index(name) % len(GROUP_COLOURS)]
 
 
-def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
+def ethograms(animals: Sequence[SessionAnimal]) -> Figure | None:
     """A row for each session, in order of group; None if no session has bouts."""
     rows = [
-        (group, seen)
-        for group, subjects in by_group(all_seen).items()
+        (group, animal)
+        for group, subjects in by_group(animals).items()
         for sessions in subjects.values()
-        for seen in sessions
+        for animal in sessions
     ]
-    n = sum(len(seen.bouts) for seen in all_seen)
+    n = sum(len(animal.bouts) for animal in animals)
     if not n:
         return None
-    words = list(dict.fromkeys(word for _, seen in rows for word in seen.words))
-    duration = max(seen.duration_s for seen in all_seen)
+    words = list(dict.fromkeys(word for _, animal in rows for word in animal.words))
+    duration = max(animal.duration_s for animal in animals)
     unit, size = time_unit(duration)
     height = max(3.4 * len(rows), 8.0)
     bottom = 8.0 + 4.0 * key_rows(words)
@@ -90,41 +90,24 @@ def ethograms(all_seen: Sequence[Seen]) -> Figure | None:
     axes = panel(figure, LEFT_MM + 8.0, bottom, width, height)
     axes.set_title(f"Ethograms, n = {counted(len(rows), 'session')}, {counted(n, 'bout')}")
     colours = action_colours(words)
-    least = 0.05 * duration / width
-    for k, (_, seen) in enumerate(rows):
-        lost = [(float(a), float(b)) for a, b in seen.lost_s]
-        axes.broken_barh(
-            [(a / size, (b - a) / size) for a, b in joined(lost, least)],
-            (k - 0.42, 0.84),
-            facecolor=PAPER,
-            edgecolor=MUTED,
-            linewidth=0.0,
-            hatch="//////",
-            zorder=1.5,
-        )
-        for word in seen.words:
-            own = seen.bouts.loc[seen.bouts["action"] == word, ["start_s", "stop_s"]]
-            bars = joined([(float(a), float(b)) for a, b in own.to_numpy(float)], least)
-            axes.broken_barh(
-                [(a / size, max(b - a, least) / size) for a, b in bars],
-                (k - 0.42, 0.84),
-                facecolor=colours[word],
-            )
-    axes.set_ylim(len(rows) - 0.5, -0.5)
-    axes.set_yticks(
-        range(len(rows)), [f"{seen.session.name} · {group}" for group, seen in rows], size=5.0
-    )
-    axes.tick_params(axis="y", length=0)
-    axes.set_xlim(0.0, duration / size)
-    axes.set_xlabel(f"time, {unit}")
+    hair_s = 0.05 * duration / width
+    for k, (_, animal) in enumerate(rows):
+        row = (k - 0.42, 0.84)
+        draw_spans(axes, animal.lost_s, row, size, hair_s)
+        for word in animal.words:
+            own = animal.bouts.loc[animal.bouts["action"] == word, ["start_s", "stop_s"]]
+            draw_spans(axes, own.to_numpy(float), row, size, hair_s, colours[word])
+    name_rows(axes, [f"{animal.session.name} · {group}" for group, animal in rows])
+    axes.tick_params(axis="y", labelsize=5.0)
+    axes.set(xlim=(0.0, duration / size), xlabel=f"time, {unit}")
     action_key(figure, colours)
     return figure
 
 
-def occupancy_by_subject(all_seen: Sequence[Seen]) -> Figure | None:
+def occupancy_by_subject(animals: Sequence[SessionAnimal]) -> Figure | None:
     """Heatmaps of every subject, the sum of its sessions; None without a known position."""
     panels = []
-    for group, subjects in _occupancies(all_seen).items():
+    for group, subjects in _occupancies(animals).items():
         for who, (session, found) in subjects.items():
             text = f"{who} ({group}), {found.observed_s:.1f} s\nn = {counted(found.n, 'frame')}"
             panels.append((text, session, found))
@@ -132,10 +115,10 @@ def occupancy_by_subject(all_seen: Sequence[Seen]) -> Figure | None:
     return occupancy_panels(title, panels)
 
 
-def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
+def occupancy_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
     """Heatmaps of every group, with equal weight of its subjects; None without a known position."""
     panels = []
-    for group, subjects in _occupancies(all_seen).items():
+    for group, subjects in _occupancies(animals).items():
         own = [found for _, found in subjects.values() if found.n]
         if own:
             mean = replace(_added(own), time_s=np.mean([found.time_s for found in own], axis=0))
@@ -146,10 +129,10 @@ def occupancy_by_group(all_seen: Sequence[Seen]) -> Figure | None:
     return occupancy_panels(title, panels)
 
 
-def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
+def budgets_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
     """Share of the time in each action, by subject and as group means; None without actions."""
-    groups = by_group(all_seen)
-    words = list(dict.fromkeys(word for seen in all_seen for word in seen.words))
+    groups = by_group(animals)
+    words = list(dict.fromkeys(word for animal in animals for word in animal.words))
     shares = {
         group: np.array([_budget(sessions, words) for sessions in subjects.values()])
         for group, subjects in groups.items()
@@ -171,37 +154,33 @@ def budgets_by_group(all_seen: Sequence[Seen]) -> Figure | None:
         mark = GROUP_MARKS[g % len(GROUP_MARKS)]
         for one in values:
             axes.plot(100.0 * one, at, mark, color=colour, markersize=2.2, gid=f"subjects {group}")
-    axes.set_yticks(range(len(words)), [word.replace("_", " ") for word in words])
-    axes.set_ylim(len(words) - 0.5, -0.5)
-    axes.tick_params(axis="y", length=0)
-    axes.set_xlim(left=0.0)
-    axes.set_xlabel("share of the observed time, %")
+    name_rows(axes, [word.replace("_", " ") for word in words])
+    axes.set(xlim=(0.0, None), xlabel="share of the observed time, %")
     figure.legend(
         loc="upper left", bbox_to_anchor=(0.0, 1.0 - 5.0 / (figure.get_size_inches()[1] * 25.4))
     )
     return figure
 
 
-def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
+def distance_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
     """Cumulative distance of every session, and each group's mean; None without a known step."""
-    groups = by_group(all_seen)
+    groups = by_group(animals)
     walks = {
         group: [
-            walked(seen)
+            walked(animal)
             for sessions in subjects.values()
-            for seen in sessions
-            if seen.kinematics is not None and len(seen.kinematics)
+            for animal in sessions
+            if animal.kinematics is not None and len(animal.kinematics)
         ]
         for group, subjects in groups.items()
     }
     if not any(n for some in walks.values() for _, _, n in some):
         return None
-    duration = max(seen.duration_s for seen in all_seen)
+    duration = max(animal.duration_s for animal in animals)
     unit, size = time_unit(duration)
     figure = sheet(ONE_COLUMN_MM, 58.0 + 3.5 * len(groups))
     axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 40.0)
     lines = [f"{group}, n = {counted(len(some), 'session')}" for group, some in walks.items()]
-    axes.set_title("\n".join(["Cumulative distance: sessions, and the mean", *lines]))
     for group, some in walks.items():
         colour = group_colour(group, list(groups))
         for time_s, metres, _ in some:
@@ -212,10 +191,9 @@ def distance_by_group(all_seen: Sequence[Seen]) -> Figure | None:
             grid = np.linspace(0.0, min(float(time_s[-1]) for time_s, _, _ in known), 400)
             mean = np.mean([np.interp(grid, time_s, metres) for time_s, metres, _ in known], axis=0)
             axes.plot(grid / size, mean, color=colour, linewidth=1.5, label=group)
-    axes.set_xlim(0.0, duration / size)
-    axes.set_ylim(bottom=0.0)
-    axes.set_xlabel(f"time, {unit}")
-    axes.set_ylabel("distance, m")
+    title = "\n".join(["Cumulative distance: sessions, and the mean", *lines])
+    axes.set(xlabel=f"time, {unit}", ylabel="distance, m", title=title)
+    axes.set(xlim=(0.0, duration / size), ylim=(0.0, None))
     axes.grid(color=LINE, linewidth=0.4)
     axes.legend(loc="upper left")
     return figure
@@ -258,18 +236,16 @@ def comparison(
     bottom = 13.0 + 2.6 * len(lines)
     figure = sheet(TWO_COLUMNS_MM, height + bottom + 9.0)
     left = panel(figure, 16.0, bottom, 72.0, height)
-    counts = []
-    n_animals = []
+    counts, n_animals = [], []
     for k, name in enumerate(names):
         rows = known[known["group"] == name]
         n = rows["subject_id"].nunique()
-        _strip(left, k, rows, factor * rows[measure].to_numpy(float), name, names, link)
+        _strip(left, k, rows, factor * rows[measure].to_numpy(float), names, link)
         n_animals.append(f"{n} {name}")
         counts.append(f"{name}\n{counted(n, 'animal')}, {counted(len(rows), 'session')}")
     left.set_xticks(range(len(names)), counts)
-    left.set_xlim(-0.6, len(names) - 0.4)
-    left.set_ylabel(read_as(measure, unit))
-    left.set_title(f"{titled(measure, unit)}, n = {', '.join(n_animals[::-1])} (animals)")
+    title = f"{titled(measure, unit)}, n = {', '.join(n_animals[::-1])} (animals)"
+    left.set(xlim=(-0.6, len(names) - 0.4), ylabel=read_as(measure, unit), title=title)
     left.grid(axis="y", color=LINE, linewidth=0.4)
     edge = figure.get_size_inches()[1] * 25.4
     figure.text(
@@ -302,9 +278,9 @@ def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
         ],
         size=5.5,
     )
-    axes.set_ylim(len(known) - 0.5, -0.5)
     heading(figure, f"Effect sizes, n = {counted(len(known), 'comparison')}")
-    axes.set_xlabel("Hedges' g with its 95 % interval; hollow: no test")
+    label = "Hedges' g with its 95 % interval; hollow: no test"
+    axes.set(ylim=(len(known) - 0.5, -0.5), xlabel=label)
     return figure
 
 
@@ -313,31 +289,36 @@ def _strip(
     k: int,
     rows: pd.DataFrame,
     values: Array,
-    name: str,
     names: Sequence[str],
-    link: Callable[[str], str] | None = None,
+    link: Callable[[str], str] | None,
 ) -> None:
     """One group: a small mark per session, a large one per animal, a line at the animals' mean."""
-    animal, animals = pd.factorize(rows["subject_id"].astype(str))
+    animal, names_of = pd.factorize(rows["subject_id"].astype(str))
     means = animal_means(values, animal)
-    beside = np.linspace(-0.2, 0.2, len(animals)) if len(animals) > 1 else np.zeros(1)
-    colour, mark = group_colour(name, names), GROUP_MARKS[k % len(GROUP_MARKS)]
-    gid = f"animals {name}"
+    beside = np.linspace(-0.2, 0.2, len(names_of)) if len(names_of) > 1 else np.zeros(1)
+    colour, mark = group_colour(names[k], names), GROUP_MARKS[k % len(GROUP_MARKS)]
+    gid = f"animals {names[k]}"
     large = axes.scatter(k + beside, means, 20.0, colour, marker=mark, gid=gid, zorder=3)
     small = None
-    if len(values) > len(animals):  # else the sessions are the animals
+    if len(values) > len(names_of):  # else the sessions are the animals
         at = k + beside[animal] + 0.03
         small = axes.scatter(at, values, 4.0, colour, marker=mark, alpha=0.5, zorder=2)
     if link is not None:
         keys = rows["key"].astype(str)
         sizes = [counted(int(n), "session") for n in np.bincount(animal)]
-        of_animals = zip(keys.groupby(animal).first(), animals, sizes, means, strict=True)
-        said = [(key, f"#animal {who}, {n}: {mean:.4g}") for key, who, n, mean in of_animals]
-        large.set_urls([link(key) + quote(text, "#") for key, text in said])
+        of_animals = zip(keys.groupby(animal).first(), names_of, sizes, means, strict=True)
+        large.set_urls(
+            [
+                link(key) + quote(f"#animal {who}, {n}: {mean:.4g}", "#")
+                for key, who, n, mean in of_animals
+            ]
+        )
         if small is not None:
-            each = [(key, f"#{key}: {value:.4g}") for key, value in zip(keys, values, strict=True)]
-            small.set_urls([link(key) + quote(text, "#") for key, text in each])
-    axes.plot([k - 0.3, k + 0.3], [means.mean()] * 2, color=INK, linewidth=1.2, gid=f"mean {name}")
+            each = zip(keys, values, strict=True)
+            small.set_urls([link(key) + quote(f"#{key}: {value:.4g}", "#") for key, value in each])
+    axes.plot(
+        [k - 0.3, k + 0.3], [means.mean()] * 2, color=INK, linewidth=1.2, gid=f"mean {names[k]}"
+    )
 
 
 def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> None:
@@ -352,21 +333,15 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
     for k, row in enumerate(rows):
         g = f"g {row['effect_size']:.2f}" if np.isfinite(row["effect_size"]) else "no g"
         p = f"p {row['p']:.2g}\ncorrected {row['p_fdr']:.2g}" if row["test"] else "no test"
-        axes.annotate(
-            f"{g}\n{p}",
-            (1.02, k),
-            xycoords=("axes fraction", "data"),
-            va="center",
-            size=5.5,
-            color=MUTED,
-        )
+        how = {"xycoords": ("axes fraction", "data"), "va": "center", "size": 5.5, "color": MUTED}
+        axes.annotate(f"{g}\n{p}", (1.02, k), **how)
     axes.set_yticks(
         range(len(known)),
         [f"{row['contrast']}\nn = {counted_units(row)}".replace(", ", ",\n") for row in rows],
         size=5.5,
     )
-    axes.set_ylim(len(known) - 0.4, -0.6)
-    axes.set_xlabel(f"difference{f', {unit}' if unit else ''}, with its 95 % interval")
+    label = f"difference{f', {unit}' if unit else ''}, with its 95 % interval"
+    axes.set(ylim=(len(known) - 0.4, -0.6), xlabel=label)
 
 
 def _intervals(
@@ -384,21 +359,22 @@ def _intervals(
     axes.tick_params(axis="y", length=0)
 
 
-def _occupancies(all_seen: Sequence[Seen]) -> dict[str, dict[str, tuple[Session, Occupancy]]]:
+def _occupancies(
+    animals: Sequence[SessionAnimal],
+) -> dict[str, dict[str, tuple[Session, Occupancy]]]:
     """Each subject's first session and its occupancy on a common grid, by group."""
-    corners = [extent_mm(one.session, one.xy_mm, centred=True) for one in all_seen]
-    low = np.min([corner[0] for corner in corners], axis=0)
-    high = np.max([corner[1] for corner in corners], axis=0)
+    corners = np.array([extent_mm(one.session, one.xy_mm, centred=True) for one in animals])
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
 
-    def framed(seen: Seen) -> Occupancy:
-        return occupancy(aligned(seen.session, seen.xy_mm), seen.hold_s, low, high)
+    def framed(animal: SessionAnimal) -> Occupancy:
+        return occupancy(aligned(animal.session, animal.xy_mm), animal.hold_s, low, high)
 
     return {
         group: {
-            who: (sessions[0].session, _added([framed(seen) for seen in sessions]))
+            who: (sessions[0].session, _added([framed(animal) for animal in sessions]))
             for who, sessions in subjects.items()
         }
-        for group, subjects in by_group(all_seen).items()
+        for group, subjects in by_group(animals).items()
     }
 
 
@@ -408,7 +384,7 @@ def _added(some: Sequence[Occupancy]) -> Occupancy:
     return replace(some[0], time_s=total, n=sum(found.n for found in some))
 
 
-def _budget(sessions: Sequence[Seen], words: Sequence[str]) -> pd.Series[float]:
+def _budget(sessions: Sequence[SessionAnimal], words: Sequence[str]) -> pd.Series[float]:
     """Share of a subject's time in each action: the mean of its sessions; NaN if unknown."""
-    known = [{} if seen.summary is None else dict(seen.summary) for seen in sessions]
+    known = [dict(animal.summary) for animal in sessions if animal.summary is not None]
     return pd.DataFrame(known, columns=[f"{word}_share" for word in words], dtype=float).mean()

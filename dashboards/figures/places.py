@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.activity import Occupancy, occupancy
@@ -14,7 +19,7 @@ from liex_lab.scene.scene import Fixture
 from liex_lab.sessions import Session
 
 from ..units import counted
-from .seen import Array, Seen
+from .animals import Array, SessionAnimal
 from .style import (
     INK,
     MUTED,
@@ -29,10 +34,6 @@ from .style import (
     sheet,
     time_unit,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MOST_PLACES = 20_000  # of a trajectory: five per second of an hour
 _PIECES = 64  # colours of a trajectory
@@ -81,19 +82,22 @@ def draw_outlines(axes: Axes, session: Session, named: bool = True, centred: boo
         named: whether to write the zones' names.
         centred: use the coordinates of `aligned`.
     """
-    walls = session.arena.outline_mm()
-    outlines = [("arena", walls)] if len(walls) else []
-    outlines += [(f"zone {zone.name}", zone.outline_mm()) for zone in session.zones]
-    for name, corners in outlines:
+    outlines: list[tuple[str, Array, Any]] = [("arena", session.arena.outline_mm(), "-")]
+    outlines += [(zone.name, zone.outline_mm(), (0, (4, 2))) for zone in session.zones]
+    for k, (name, corners, dashed) in enumerate(outlines):
+        if not len(corners):
+            continue
         corners = aligned(session, corners) if centred else corners
-        closed = np.vstack([corners, corners[:1]])
-        dashed = "-" if name == "arena" else (0, (4, 2))
-        axes.plot(*closed.T, color=MUTED, linewidth=0.7, linestyle=dashed, gid=name)
-    for zone in session.zones if named else ():
-        corners = aligned(session, zone.outline_mm()) if centred else zone.outline_mm()
-        place = corners[:, 0].mean(), corners[:, 1].max()
-        text = axes.text(*place, zone.name, ha="center", va="top", size=6.0)
-        halo(text)
+        gid = f"zone {name}" if k else name
+        _outline(axes, corners, gid, dashed)
+        if k and named:
+            place = corners[:, 0].mean(), corners[:, 1].max()
+            halo(axes.text(*place, name, ha="center", va="top", size=6.0))
+
+
+def _outline(axes: Axes, corners: Array, gid: str, dashed: Any) -> None:
+    closed = np.vstack([corners, corners[:1]])
+    axes.plot(*closed.T, color=MUTED, linewidth=0.7, linestyle=dashed, gid=gid)
 
 
 def draw_region(axes: Axes, session: Session) -> None:
@@ -108,12 +112,26 @@ def draw_region(axes: Axes, session: Session) -> None:
         return
     rays = session.camera.unproject(np.asarray(corners, float), np.ones(len(corners)))
     place = session.T_arena_camera
-    ways = rays @ place.rotation.T
-    if (ways[:, 2] >= 0).any():  # a corner above the horizon is not on the floor
-        return
-    on_floor = place.translation + ways * (-place.translation[2] / ways[:, 2])[:, None]
-    closed = np.vstack([on_floor, on_floor[:1]])
-    axes.plot(*closed[:, :2].T, color=MUTED, linewidth=0.7, linestyle=":", gid="region")
+    turned = rays @ place.rotation.T
+    if (turned[:, 2] < 0).all():  # a corner above the horizon is not on the floor
+        on_floor = place.translation + turned * (-place.translation[2] / turned[:, 2])[:, None]
+        _outline(axes, on_floor[:, :2], "region", ":")
+
+
+def in_image(session: Session, xy_mm: Array, height_mm: float = 0.0) -> Array:
+    """Positions (n, 2) mm above the floor -> (n, 2) px; empty if any is behind the camera."""
+    points = np.column_stack([xy_mm.reshape(-1, 2), np.full(len(xy_mm), height_mm)])
+    uv = session.camera.project(session.T_arena_camera.inverse() @ points)
+    return uv if np.isfinite(uv).all() else np.empty((0, 2))
+
+
+def hidden_places(session: Session) -> Array:
+    """(n, 4) last positions of hidden animals: x, y mm, and from when to when, s."""
+    gaps = session.gaps
+    if "x_mm" not in gaps:  # sessions of earlier versions lack the position
+        return np.empty((0, 4))
+    hidden = gaps[(gaps["reason"] == "hidden") & gaps["x_mm"].notna()]
+    return hidden[["x_mm", "y_mm", "start_s", "stop_s"]].to_numpy(float)
 
 
 def draw_hidden(axes: Axes, session: Session) -> None:
@@ -123,17 +141,10 @@ def draw_hidden(axes: Axes, session: Session) -> None:
         axes: a panel with axes in millimetres.
         session: the opened session.
     """
-    gaps = session.gaps
-    if "x_mm" not in gaps:  # sessions of earlier versions lack the position
-        return
-    hidden = gaps[(gaps["reason"] == "hidden") & gaps["x_mm"].notna()]
-    columns = hidden[["x_mm", "y_mm", "start_s", "stop_s"]].to_numpy(float)
-    for x, y, start, stop in columns:
+    for x, y, start, stop in hidden_places(session):
         axes.plot(x, y, "x", color=INK, markersize=4, gid="hidden")
-        text = axes.annotate(
-            f"hidden {stop - start:.1f} s", (x, y), (3, 2), textcoords="offset points", size=6.0
-        )
-        halo(text)
+        text = f"hidden {stop - start:.1f} s"
+        halo(axes.annotate(text, (x, y), (3, 2), textcoords="offset points", size=6.0))
 
 
 def draw_occupancy(axes: Axes, found: Occupancy, most: float) -> Any:
@@ -157,72 +168,57 @@ def draw_occupancy(axes: Axes, found: Occupancy, most: float) -> Any:
     )
 
 
-def occupancy_of(seen: Seen) -> Occupancy:
+def occupancy_of(animal: SessionAnimal) -> Occupancy:
     """The occupancy of an animal over the extent of its floor figures."""
-    low, high = extent_mm(seen.session, seen.xy_mm)
-    return occupancy(seen.xy_mm, seen.hold_s, low, high)
+    low, high = extent_mm(animal.session, animal.xy_mm)
+    return occupancy(animal.xy_mm, animal.hold_s, low, high)
 
 
-def occupancy_map(seen: Seen) -> Figure | None:
+def occupancy_map(animal: SessionAnimal) -> Figure | None:
     """Heatmap of the time per area, with walls and zones; None without positions, and for a
     hand.
     """
-    found = occupancy_of(seen)
-    if found.n == 0 or _is_hand(seen):
+    found = occupancy_of(animal)
+    if found.n == 0 or axis_of(animal.session.metadata["animal"]).kind == BRANCHES:
         return None
-    title = (
-        f"Occupancy, {seen.who}\nn = {counted(found.n, 'frame')}, {found.observed_s:.1f} s observed"
-    )
-    figure, axes = _floor_sheet(title)
-    image = draw_occupancy(axes, found, _most(found))
-    draw_outlines(axes, seen.session)
-    draw_hidden(axes, seen.session)
-    floor_limits(axes, *extent_mm(seen.session, seen.xy_mm))
-    scale_bar(axes)
-    _colour_bar(figure, image, "s/cm²")
-    return figure
-
-
-def _is_hand(seen: Seen) -> bool:
-    """Whether the animal is a hand, whose position on the floor has no meaning."""
-    return axis_of(seen.session.metadata["animal"]).kind == BRANCHES
-
-
-def trajectory(seen: Seen) -> Figure | None:
-    """Path of the body's centre from above by time; None without a position, and for a hand."""
-    known = np.isfinite(seen.xy_mm).all(axis=1)
-    if not known.any() or _is_hand(seen):
-        return None
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
     figure, axes = _floor_sheet(
-        f"Trajectory, {seen.who}\nn = {counted(int(known.sum()), 'frame')}, "
-        f"{seen.hold_s[known].sum():.1f} s observed"
+        f"Occupancy, {animal.who}\nn = {counted(found.n, 'frame')}, "
+        f"{found.observed_s:.1f} s observed"
     )
-    unit, size = time_unit(seen.duration_s)
-    clock = Normalize(0.0, max(seen.duration_s, 1e-9) / size)
+    image = draw_occupancy(axes, found, _most(found))
+    draw_outlines(axes, animal.session)
+    draw_hidden(axes, animal.session)
+    return _finished(figure, image, "s/cm²", *extent_mm(animal.session, animal.xy_mm))
+
+
+def trajectory(animal: SessionAnimal) -> Figure | None:
+    """Path of the body's centre from above by time; None without a position, and for a hand."""
+    known = np.isfinite(animal.xy_mm).all(axis=1)
+    if not known.any() or axis_of(animal.session.metadata["animal"]).kind == BRANCHES:
+        return None
+    figure, axes = _floor_sheet(
+        f"Trajectory, {animal.who}\nn = {counted(int(known.sum()), 'frame')}, "
+        f"{animal.hold_s[known].sum():.1f} s observed"
+    )
+    unit, size = time_unit(animal.duration_s)
+    clock = Normalize(0.0, max(animal.duration_s, 1e-9) / size)
     colours = ScalarMappable(clock, colormaps["viridis"].with_extremes())
-    way = np.column_stack([seen.column("x_mm"), seen.column("y_mm")])
-    time_s = seen.frames["time_s"].to_numpy(float)
-    rows = np.unique(np.linspace(0, len(way) - 1, min(len(way), _MOST_PLACES)).astype(int))
+    path = np.column_stack([animal.column("x_mm"), animal.column("y_mm")])
+    time_s = animal.frames["time_s"].to_numpy(float)
+    rows = np.unique(np.linspace(0, len(path) - 1, min(len(path), _MOST_PLACES)).astype(int))
     for piece in np.array_split(rows, min(_PIECES, max(1, len(rows) // 2))):
         part = np.append(piece, rows[rows > piece[-1]][:1])
         colour = colours.to_rgba(time_s[piece[0]] / size)
-        axes.plot(*way[part].T, color=colour, linewidth=1.0, solid_capstyle="round")
-    draw_outlines(axes, seen.session)
+        axes.plot(*path[part].T, color=colour, linewidth=1.0, solid_capstyle="round")
+    draw_outlines(axes, animal.session)
     first, last = np.flatnonzero(known)[[0, -1]]
     for row, word in ((first, "start"), (last, "end")):
         colour = colours.to_rgba(time_s[row] / size)
-        axes.plot(*seen.xy_mm[row], "o", color=colour, markersize=3.5, markeredgecolor=PAPER)
-        at = seen.xy_mm[row]
-        text = axes.annotate(word, (at[0], at[1]), (3, 3), textcoords="offset points", size=6.0)
-        halo(text)
-    floor_limits(axes, *extent_mm(seen.session, seen.xy_mm))
-    scale_bar(axes)
-    _colour_bar(figure, colours, f"time, {unit}")
-    return figure
+        axes.plot(*animal.xy_mm[row], "o", color=colour, markersize=3.5, markeredgecolor=PAPER)
+        x, y = animal.xy_mm[row]
+        halo(axes.annotate(word, (x, y), (3, 3), textcoords="offset points", size=6.0))
+    corners = extent_mm(animal.session, animal.xy_mm)
+    return _finished(figure, colours, f"time, {unit}", *corners)
 
 
 def arena_heights(
@@ -239,18 +235,13 @@ def arena_heights(
         Heights (ny, nx) mm, NaN where unread, and the edges of the columns (nx + 1,) and rows (ny +
             1,), mm, arena frame.
     """
-    pictures = np.where(np.stack(depth) > 0, np.stack(depth), np.nan).astype(np.float32)
+    images = np.where(np.stack(depth) > 0, np.stack(depth), np.nan).astype(np.float32)
     with np.errstate(all="ignore"):
-        seen = np.isfinite(pictures).any(axis=0)
-        still = np.full(pictures.shape[1:], np.nan)
-        still[seen] = np.nanmedian(pictures[:, seen], axis=0)
-    v, u = np.nonzero(seen)
+        read = np.isfinite(images).any(axis=0)
+        z = np.nanmedian(images[:, read], axis=0).astype(float)
+    v, u = np.nonzero(read)
     camera = session.camera
-    z = still[seen]
-    rays = np.column_stack(
-        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(z.size)]
-    )
-    points = session.T_arena_camera @ (rays * z[:, None])
+    points = session.T_arena_camera @ camera.unproject(np.column_stack([u, v]), z)
     low, high = extent_mm(session, np.empty((0, 2)))
     if not (high > low).all():
         low, high = np.percentile(points[:, :2], [1.0, 99.0], axis=0)
@@ -272,14 +263,14 @@ def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure |
         session: the opened session.
         depth: depth images as for `arena_heights`.
     """
-    if not len(depth) or not any((picture > 0).any() for picture in depth):
+    if not any((image > 0).any() for image in depth):
         return None
     heights, x_mm, y_mm = arena_heights(session, depth)
     fixtures = session.metadata.get("scene", {}).get("fixtures", [])
     figure, axes = _floor_sheet(
         f"Arena, heights above the floor, {session.name}\n"
         f"{session.arena}; {counted(len(fixtures), 'fixture')}; n = "
-        f"{counted(len(depth), 'picture')}"
+        f"{counted(len(depth), 'image')}"
     )
     known = heights[np.isfinite(heights)]
     top = float(np.percentile(known, 99.0)) if len(known) else 10.0
@@ -298,12 +289,9 @@ def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure |
     for fixture in map(Fixture.from_dict, fixtures):
         place = fixture.centre_mm
         axes.plot(*place, "+", color=PAPER, markersize=4)
-        text = axes.annotate(str(fixture), place, (3, 2), textcoords="offset points", size=6.0)
-        halo(text)
-    floor_limits(axes, [x_mm[0], y_mm[0]], [x_mm[-1], y_mm[-1]])
-    scale_bar(axes)
-    _colour_bar(figure, image, "height, mm")
-    return figure
+        halo(axes.annotate(str(fixture), place, (3, 2), textcoords="offset points", size=6.0))
+    corners = np.array([[x_mm[0], y_mm[0]], [x_mm[-1], y_mm[-1]]])
+    return _finished(figure, image, "height, mm", *corners)
 
 
 def occupancy_panels(title: str, panels: Sequence[tuple[str, Session, Occupancy]]) -> Figure | None:
@@ -330,8 +318,7 @@ def occupancy_panels(title: str, panels: Sequence[tuple[str, Session, Occupancy]
         )
         image = draw_occupancy(axes, found, most)
         draw_outlines(axes, session, named=k == 0, centred=True)
-        corners = [found.x_mm[0], found.y_mm[0]], [found.x_mm[-1], found.y_mm[-1]]
-        floor_limits(axes, *corners)
+        floor_limits(axes, (found.x_mm[0], found.y_mm[0]), (found.x_mm[-1], found.y_mm[-1]))
         axes.set_title(name, size=6.5)
         scale_bar(axes)
     heading(figure, title)
@@ -352,6 +339,14 @@ def _floor_sheet(title: str) -> tuple[Figure, Axes]:
     axes = panel(figure, 2.0, 7.0, 69.0, 69.0)
     axes.set_title(title)
     return figure, axes
+
+
+def _finished(figure: Figure, image: Any, label: str, low_mm: Array, high_mm: Array) -> Figure:
+    """A figure of `_floor_sheet` with its limits, scale bar and colour bar."""
+    floor_limits(figure.axes[0], low_mm, high_mm)
+    scale_bar(figure.axes[0])
+    _colour_bar(figure, image, label)
+    return figure
 
 
 def _colour_bar(figure: Figure, image: Any, label: str) -> None:

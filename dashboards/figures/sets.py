@@ -7,14 +7,14 @@ import io
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
 
 from liex_lab.behaviour.cohort import WHO
 from liex_lab.errors import SessionError
@@ -25,35 +25,31 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_harmless
 from liex_lab.sessions import Session
 
-from . import actions, groups, places, times
-from .seen import DepthReader, Seen, animals
+from . import groups, places, times
+from .animals import DepthImages, SessionAnimal, keeps_depth, session_animals
 from .style import FORMATS, drawing, image_bytes, on_page
-
-if TYPE_CHECKING:
-    from matplotlib.backends.backend_pdf import PdfPages
-    from matplotlib.figure import Figure
 
 FOLDER = "figures"
 PAGES = "pages"  # the format with all figures in one file, one per page
 KINDS = (*FORMATS, PAGES)
 _PAGES_FILE = "figures.pdf"
 COMPARISON_FILE = "comparison.json"
-_PICTURES = 9  # frames from which the empty arena is computed
-OF_SESSION: dict[str, tuple[str, Callable[[Seen], Figure | None]]] = {
+_N_FRAMES = 9  # frames from which the empty arena is computed
+OF_SESSION: dict[str, tuple[str, Callable[[SessionAnimal], Figure | None]]] = {
     "ethogram": ("what the animal did when", times.ethogram),
     "curves": ("speed, heights and predicted error over time", times.curves),
     "occupancy": ("time per area of the floor, with walls and zones", places.occupancy_map),
     "trajectory": ("way of the body's centre from above", places.trajectory),
-    "arena": ("heights of the arena above its floor", lambda seen: _arena(seen.session)),
-    "time_budget": ("share of the time in each action", actions.time_budget),
-    "activity": ("shares of the actions over the session", actions.activity),
-    "transitions": ("what follows upon what, against chance", actions.transitions),
-    "onsets": ("measures about the onsets of actions", actions.aligned_curves),
+    "arena": ("heights of the arena above its floor", lambda animal: _arena(animal.session)),
+    "time_budget": ("share of the time in each action", times.time_budget),
+    "activity": ("shares of the actions over the session", times.activity),
+    "transitions": ("what follows upon what, against chance", times.transitions),
+    "onsets": ("measures about the onsets of actions", times.aligned_curves),
     "distance": ("distance summed up over the session", times.cumulative_distance),
     "speed": ("share of the time at each speed", times.speed_distribution),
     "error": ("share of the time at each predicted error", times.error_distribution),
 }
-OF_STUDY: dict[str, tuple[str, Callable[[Sequence[Seen]], Figure | None]]] = {
+OF_STUDY: dict[str, tuple[str, Callable[[Sequence[SessionAnimal]], Figure | None]]] = {
     "ethograms": ("a row for each session", groups.ethograms),
     "occupancy_subjects": ("occupancy of every subject", groups.occupancy_by_subject),
     "occupancy_groups": ("occupancy of every group", groups.occupancy_by_group),
@@ -62,19 +58,8 @@ OF_STUDY: dict[str, tuple[str, Callable[[Sequence[Seen]], Figure | None]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A figure of a set.
-
-    Attributes:
-        name: of its files.
-        what: its description.
-        figure: the figure; None if there is nothing to draw.
-    """
-
-    name: str
-    what: str
-    figure: Figure | None
+# name of its files, description, and the figure; None if there is nothing to draw
+Drawn = tuple[str, str, Figure | None]
 
 
 def session_figures(session: Session, only: Sequence[str] = ()) -> Iterator[Drawn]:
@@ -86,11 +71,11 @@ def session_figures(session: Session, only: Sequence[str] = ()) -> Iterator[Draw
         session: the opened session.
         only: names of `OF_SESSION`; () draws all.
     """
-    for seen in animals(session):
+    for animal in session_animals(session):
         for name in only or OF_SESSION:
             what, draw = OF_SESSION[name]
-            own = name if seen.alone else safe_name(f"{name}-{seen.individual}")
-            yield Drawn(own, what, draw(seen))
+            own = name if animal.alone else safe_name(f"{name}-{animal.individual}")
+            yield own, what, draw(animal)
 
 
 def study_figures(sessions: Sequence[Session], only: Sequence[str] = ()) -> Iterator[Drawn]:
@@ -100,7 +85,9 @@ def study_figures(sessions: Sequence[Session], only: Sequence[str] = ()) -> Iter
         sessions: the opened sessions.
         only: names of `OF_STUDY`; () draws all.
     """
-    yield from _of_many([seen for session in sessions for seen in animals(session)], only)
+    yield from _of_many(
+        [animal for session in sessions for animal in session_animals(session)], only
+    )
 
 
 def comparison_figures(
@@ -117,27 +104,30 @@ def comparison_figures(
         sessions: the opened sessions; () omits the figures that need them.
         only: names of `OF_STUDY`, 'effects', or measures of `stats`; () draws all.
     """
-    units = _units(sessions)
-    said = str(table.attrs.get("accounted", ""))
+    none = pd.DataFrame(columns=["table", "name", "unit"])
+    columns = pd.concat([none, *(session.columns for session in sessions)])
+    known = columns[columns["table"] == "summary"].drop_duplicates("name")
+    units = dict(zip(known["name"].astype(str), known["unit"].fillna("").astype(str), strict=True))
+    accounted = str(table.attrs.get("accounted", ""))
     only = only or ("effects", *stats["measure"].astype(str), *OF_STUDY)
     if "effects" in only:
-        yield Drawn("effects", "effect sizes with their intervals", groups.effects(stats, units))
+        yield "effects", "effect sizes with their intervals", groups.effects(stats, units)
     for measure in (one for one in dict.fromkeys(stats["measure"].astype(str)) if one in only):
-        drawn = groups.comparison(table, stats, measure, units.get(measure, ""), said)
-        yield Drawn(_name_of(measure), "every animal, and the difference", drawn)
+        drawn = groups.comparison(table, stats, measure, units.get(measure, ""), accounted)
+        yield _name_of(measure), "every animal, and the difference", drawn
     wanted = [name for name in OF_STUDY if name in only]
     if sessions and wanted:
         yield from _of_many(_grouped(sessions, table), wanted, list(stats["reference"])[:1])
 
 
 def _of_many(
-    all_seen: Sequence[Seen], only: Sequence[str], reference: Sequence[str] = ()
+    animals: Sequence[SessionAnimal], only: Sequence[str], reference: Sequence[str] = ()
 ) -> Iterator[Drawn]:
-    groups_in_order = [*reference, *references_first(seen.group for seen in all_seen)]
-    all_seen = sorted(all_seen, key=lambda seen: groups_in_order.index(seen.group))
+    groups_in_order = [*reference, *references_first(animal.group for animal in animals)]
+    animals = sorted(animals, key=lambda animal: groups_in_order.index(animal.group))
     for name in only or OF_STUDY:
         what, draw = OF_STUDY[name]
-        yield Drawn(name, what, draw(all_seen))
+        yield name, what, draw(animals)
 
 
 def _name_of(measure: str) -> str:
@@ -176,16 +166,15 @@ def write_figures(
     empty: list[str] = []
     alone = [kind for kind in kinds if kind != PAGES]
     with drawing(), _one_pdf(folder if PAGES in kinds else None) as pages:
-        for k, one in enumerate(drawn):
+        for k, (name, _, figure) in enumerate(drawn):
             progress(k, None, "drawing figures")
-            if one.figure is None:
-                empty.append(one.name)
+            if figure is None:
+                empty.append(name)
                 continue
             for kind in alone:
-                name = f"{one.name}.{kind}"
-                files.append(put_figure(folder, name, image_bytes(one.figure, kind)))
+                files.append(put_figure(folder, f"{name}.{kind}", image_bytes(figure, kind)))
             if pages is not None:
-                pages.savefig(one.figure)
+                pages.savefig(figure)
     if PAGES in kinds and (folder / _PAGES_FILE).is_file():
         files.append(folder / _PAGES_FILE)
     return files, empty
@@ -200,8 +189,6 @@ def _one_pdf(folder: Path | None) -> Iterator[PdfPages | None]:
     if folder is None:
         yield None
         return
-    from matplotlib.backends.backend_pdf import PdfPages
-
     held = io.BytesIO()
     with PdfPages(held, metadata={"CreationDate": None}) as pages:
         yield pages
@@ -222,8 +209,7 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
         PlaceError: the path is a symbolic link.
     """
     unlinked(folder).mkdir(parents=True, exist_ok=True)
-    stem, dot, kind = name.rpartition(".")
-    place = inside(folder, stem, f"{dot}{kind}")
+    place = inside(folder, Path(name).stem, Path(name).suffix)
     with replacing(place) as part:
         part.write_bytes(content)
     return place
@@ -302,20 +288,17 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     asked = {str(kind) for kind in report.get("figures", ())}
     paged = PAGES in asked or _PAGES_FILE in there
     with drawing(), _one_pdf(folder if paged else None) as pages:
-        for one in session_figures(session):
-            if one.figure is None:
+        for name, what, figure in session_figures(session):
+            if figure is None:
                 continue
-            svg = image_bytes(one.figure, "svg")
-            made[one.name] = on_page(svg, one.name, f"{one.name.replace('_', ' ')}: {one.what}")
-            if folder is None:
-                continue
-            put_figure(folder, f"{one.name}.svg", svg)
-            for kind in FORMATS:
-                name = f"{one.name}.{kind}"
-                if kind != "svg" and (kind in asked or name in there):
-                    put_figure(folder, name, image_bytes(one.figure, kind))
+            svg = image_bytes(figure, "svg")
+            made[name] = on_page(svg, name, f"{name.replace('_', ' ')}: {what}")
+            for kind in FORMATS if folder is not None else ():
+                if kind == "svg" or kind in asked or f"{name}.{kind}" in there:
+                    image = svg if kind == "svg" else image_bytes(figure, kind)
+                    put_figure(folder, f"{name}.{kind}", image)
             if pages is not None:
-                pages.savefig(one.figure)
+                pages.savefig(figure)
     if folder is not None and made:
         for old in _files(folder):  # without a figure any more
             if old.stem.split("-")[0] in OF_SESSION and old.stem not in made:
@@ -330,24 +313,23 @@ def _files(folder: Path) -> list[Path]:
 
 def _arena(session: Session) -> Figure | None:
     """The arena from some frames of the session's replay; None without depth."""
-    n = len(session.frames)
-    rows = np.unique(np.linspace(0, max(n - 1, 0), _PICTURES).astype(int)) if n else ()
-    with DepthReader(session) as reader:
-        found = [reader.picture(int(row)) for row in rows] if reader.whole else []
-    pictures: list[NDArray[np.uint16]] = [picture for picture in found if picture is not None]
-    return places.arena_map(session, pictures)
+    n = len(session.frames) if keeps_depth(session) else 0
+    rows = np.unique(np.linspace(0, max(n - 1, 0), _N_FRAMES).astype(int)) if n else ()
+    with closing(DepthImages()) as images:
+        found = [images.depth(session, int(row)) for row in rows]
+    return places.arena_map(session, [image for image in found if image is not None])
 
 
-def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
+def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[SessionAnimal]:
     """The animals with their groups in a comparison; animals without a group are left out."""
     who = ["session_id", "individual"]
     named = table.astype(dict.fromkeys(who, str)).groupby(who)["group"]
     stated = {key: list(groups_of) for key, groups_of in named}
-    every = [seen for session in sessions for seen in animals(session)]
-    there = Counter((seen.session.name, seen.individual) for seen in every)
+    every = [animal for session in sessions for animal in session_animals(session)]
+    there = Counter((animal.session.name, animal.individual) for animal in every)
     found = []
-    for seen in every:
-        key = seen.session.name, seen.individual
+    for animal in every:
+        key = animal.session.name, animal.individual
         own = stated.get(key, [])
         # rows of sessions with one name, in several folders, are in the sessions' order; if one
         # of them is missing, the rows cannot be assigned
@@ -355,13 +337,5 @@ def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[Seen]:
             group = own[0] if len(own) == 1 else own.pop(0)
             there[key] -= 1
             if isinstance(group, str) and group:
-                found.append(replace(seen, group=group))
+                found.append(replace(animal, group=group))
     return found
-
-
-def _units(sessions: Sequence[Session]) -> dict[str, str]:
-    """The unit of every column of the summaries."""
-    tables = [session.columns for session in sessions]
-    known = pd.concat([pd.DataFrame(columns=["table", "name", "unit"]), *tables])
-    known = known[known["table"] == "summary"].drop_duplicates("name")
-    return dict(zip(known["name"].astype(str), known["unit"].fillna("").astype(str), strict=True))

@@ -13,13 +13,16 @@ import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from html import escape
+from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from .animals import Array
 
 FORMATS = ("svg", "pdf", "png")
 ONE_COLUMN_MM = 89.0
@@ -92,8 +95,6 @@ def drawing() -> Iterator[None]:
 
     Warnings of missing glyphs are suppressed, because an SVG uses the reader's font.
     """
-    from matplotlib import rc_context
-
     style: Any = _STYLE  # matplotlib types every setting's name
     with _ONE_AT_A_TIME, rc_context(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
@@ -102,8 +103,6 @@ def drawing() -> Iterator[None]:
 
 def sheet(width_mm: float, height_mm: float) -> Figure:
     """An empty figure of a size in mm."""
-    from matplotlib.figure import Figure
-
     return Figure(figsize=(width_mm / 25.4, height_mm / 25.4))
 
 
@@ -130,12 +129,6 @@ def heading(figure: Figure, text: str) -> None:
     figure.text(2.0 / across, 1.0 - 2.0 / up, text, size=7.0, va="top")
 
 
-def bar_length_mm(extent_mm: float) -> float:
-    """A round length of a scale bar, mm: about a quarter of the panel's extent, mm."""
-    fitting = [length for length in _BARS_MM if length <= 0.35 * extent_mm]
-    return fitting[-1] if fitting else _BARS_MM[0]
-
-
 def scale_bar(axes: Axes) -> float:
     """Draw a scale bar below a panel with axes in millimetres; returns its length, mm.
 
@@ -143,7 +136,8 @@ def scale_bar(axes: Axes) -> float:
     """
     left, right = axes.get_xlim()
     low, high = axes.get_ylim()
-    length = bar_length_mm(right - left)
+    # about a quarter of the panel, and round
+    length = max([mm for mm in _BARS_MM if mm <= 0.35 * (right - left)], default=_BARS_MM[0])
     y = low - 0.03 * (high - low)
     axes.plot(
         [left, left + length],
@@ -169,9 +163,8 @@ def floor_limits(axes: Axes, low_mm: Any, high_mm: Any) -> None:
     """
     middle = 0.5 * (np.asarray(low_mm) + np.asarray(high_mm))
     reach = 0.52 * max(float(np.max(np.asarray(high_mm) - np.asarray(low_mm))), 20.0)
-    axes.set_xlim(middle[0] - reach, middle[0] + reach)
-    axes.set_ylim(middle[1] - reach, middle[1] + reach)
-    axes.set_aspect("equal")
+    (x0, y0), (x1, y1) = middle - reach, middle + reach
+    axes.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
     axes.set_axis_off()
 
 
@@ -202,11 +195,61 @@ def action_key(figure: Figure, colours: Mapping[str, str]) -> None:
         figure: the figure.
         colours: action -> colour.
     """
-    from matplotlib.patches import Patch
-
     marks = [Patch(color=colour, label=word.replace("_", " ")) for word, colour in colours.items()]
     if marks:
         figure.legend(handles=marks, loc="lower center", ncols=_KEYS, handlelength=1.0)
+
+
+def name_rows(axes: Axes, names: Sequence[str], least: int = 0) -> None:
+    """Name the rows of a panel, the first on top; at least `least` rows."""
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(max(len(names), least) - 0.5, -0.5)
+    axes.tick_params(axis="y", length=0)
+
+
+def draw_spans(
+    axes: Axes,
+    spans_s: Array,
+    row: tuple[float, float],
+    size: float,
+    hair_s: float,
+    colour: str = "",
+    **style: Any,
+) -> None:
+    """Draw spans of time as bars; without a colour they are hatched, as lost time.
+
+    Args:
+        axes: a panel over time.
+        spans_s: (n, 2) start and stop of each, s, in order.
+        row: lower edge and height of the bars.
+        size: the unit of the time axis, s.
+        hair_s: the shortest visible time, s; closer spans are joined.
+        colour: of the bars.
+        style: further arguments of `broken_barh`.
+    """
+    bars = [(a, b - a) for a, b in joined(spans_s.tolist(), hair_s)]
+    if colour:
+        style["facecolor"] = colour
+        bars = [(a, max(length, hair_s)) for a, length in bars]
+    else:  # over the bars: a bout across a gap has no bar there
+        style |= {"facecolor": PAPER, "edgecolor": MUTED, "linewidth": 0.0, "hatch": "//////"}
+        style["zorder"] = 1.5
+    axes.broken_barh([(a / size, length / size) for a, length in bars], row, **style)
+
+
+def joined(spans: Sequence[Sequence[float]], least_s: float) -> list[tuple[float, float]]:
+    """Spans in order; spans closer than `least_s` are joined, up to 40 times that length.
+
+    Args:
+        spans: start and stop of each, s, in order.
+        least_s: least distance of separate spans, s.
+    """
+    out: list[tuple[float, float]] = []
+    for start, stop in spans:
+        if out and start - out[-1][1] < least_s and stop - out[-1][0] < 40 * least_s:
+            start = out.pop()[0]
+        out.append((start, stop))
+    return out
 
 
 def image_bytes(figure: Figure, kind: str) -> bytes:
@@ -217,17 +260,11 @@ def image_bytes(figure: Figure, kind: str) -> bytes:
         kind: 'svg', 'pdf' or 'png'.
     """
     held = io.BytesIO()
-    undated: dict[str, dict[str, Any]] = {
-        "svg": {"Date": None},
-        "pdf": {"CreationDate": None},
-        "png": {"Software": None},
-    }
+    undated: Any = {{"svg": "Date", "pdf": "CreationDate", "png": "Software"}[kind]: None}
     paper = "white" if kind == "png" else "none"
-    figure.savefig(held, format=kind, metadata=undated[kind], facecolor=paper)
+    figure.savefig(held, format=kind, metadata=undated, facecolor=paper)
     made = held.getvalue()
-    if kind == "svg":
-        return made.replace(_FACE.encode(), _FACES.encode())
-    return made
+    return made.replace(_FACE.encode(), _FACES.encode()) if kind == "svg" else made
 
 
 def on_page(svg: bytes, name: str, title: str) -> str:
@@ -238,22 +275,13 @@ def on_page(svg: bytes, name: str, title: str) -> str:
         name: of the figure, unique on the page.
         title: its description for screen readers.
     """
-    from html import escape
-
     text = svg.decode("utf-8")
     text = text[text.index("<svg") :]
-    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
-    text = re.sub(r"<style type=.*?</style>", "", text, flags=re.DOTALL)
-    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    box = re.search(r'viewBox="[^"]*"', text)
-    shape = box[0] if box else ""
-    text = re.sub(
-        r"<svg[^>]*>",
-        f'<svg {shape} role="img" aria-label="{escape(title)}">',
-        text,
-        count=1,
-    )
-    text = text.replace("xlink:href=", "href=")
+    extra = r"<metadata>.*?</metadata>|<style type=.*?</style>|<!--.*?-->"
+    text = re.sub(extra, "", text, flags=re.DOTALL).replace("xlink:href=", "href=")
+    shape = "".join(re.findall(r'viewBox="[^"]*"', text)[:1])
+    head = f'<svg {shape} role="img" aria-label="{escape(title)}">'
+    text = re.sub(r"<svg[^>]*>", lambda _: head, text, count=1)
     # groups have ids in the files, for editors; on the page only referenced ids are needed
     pointed = set(re.findall(r"(?:url\(|href=\")#([^\")]+)", text))
     text = re.sub(

@@ -1,19 +1,21 @@
-"""Figures over time: ethogram, curves, cumulative distance; distributions of speeds and errors."""
+"""Figures of one animal over time and by action: ethogram, curves, budgets, distributions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, Rectangle
 from numpy.typing import NDArray
 
-from liex_lab.actions.vocabulary import PREDICTED_ERROR, action_colours
+from liex_lab.actions.vocabulary import PREDICTED_ERROR, UNLABELLED_COLOUR, action_colours
+from liex_lab.behaviour.activity import Around, around_onsets, hold_times
 from liex_lab.behaviour.body import DrawnMeasure, drawn_measures
 
 from ..units import counted, shown
-from .seen import Array, Seen
+from .animals import Array, SessionAnimal
 from .style import (
     BLUE,
     INK,
@@ -23,16 +25,18 @@ from .style import (
     ONE_COLUMN_MM,
     PAPER,
     RIGHT_MM,
+    SOFT,
     TWO_COLUMNS_MM,
+    action_key,
+    draw_spans,
     halo,
+    heading,
+    key_rows,
+    name_rows,
     panel,
     sheet,
     time_unit,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _MOST_COLUMNS = 1200  # of a curve; more points cannot be distinguished on a page
 _LANE_MM = 4.0
@@ -45,94 +49,77 @@ _HAIR_MM = 0.05  # bouts with a smaller distance are one bar
 Span = tuple[float, float]
 
 
-def drawn_curves(seen: Seen) -> list[DrawnMeasure]:
+def drawn_curves(animal: SessionAnimal) -> list[DrawnMeasure]:
     """The curves of the animal that its session contains."""
-    moved = seen.kinematics
-    if moved is None:
-        return []
-    return [one for one in drawn_measures(seen.session.metadata["animal"]) if one.column in moved]
+    moved = animal.kinematics
+    curves = [] if moved is None else drawn_measures(animal.session.metadata["animal"])
+    return [one for one in curves if moved is not None and one.column in moved]
 
 
-def ethogram(seen: Seen, span_s: Span | None = None) -> Figure | None:
+def ethogram(animal: SessionAnimal, span_s: Span | None = None) -> Figure | None:
     """A lane for each action, hatched without a pose; None without actions and losses.
 
     Args:
-        seen: the animal.
+        animal: the animal.
         span_s: the displayed stretch, s; None shows the whole session.
     """
-    first_s, last_s = span_s or (0.0, seen.duration_s)
-    words = seen.words
-    if not words and not len(seen.lost_s):
+    first_s, last_s = span_s or (0.0, animal.duration_s)
+    words = animal.words
+    if not words and not len(animal.lost_s):
         return None
     height = _LANE_MM * max(len(words), 1)
     figure = sheet(TWO_COLUMNS_MM, height + 15.0)
     width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
     axes = panel(figure, LEFT_MM, 8.0, width, height)
-    bouts = seen.bouts
+    bouts = animal.bouts
     axes.set_title(
-        f"Ethogram, {seen.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame"
+        f"Ethogram, {animal.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame"
     )
     _, size = time_unit(last_s - first_s)
-    least = _HAIR_MM * (last_s - first_s) / width
+    hair_s = _HAIR_MM * (last_s - first_s) / width
 
-    def within(spans: Array) -> list[Span]:
+    def draw(spans: Array, row: tuple[float, float], gid: str, colour: str = "") -> None:
         near = spans[(spans[:, 1] >= first_s) & (spans[:, 0] <= last_s)]
-        return joined([(float(a), float(b)) for a, b in near], least)
+        draw_spans(axes, near, row, size, hair_s, colour, gid=gid)
 
-    axes.broken_barh(
-        [(a / size, (b - a) / size) for a, b in within(seen.lost_s)],
-        (-0.5, max(len(words), 1)),
-        facecolor=PAPER,  # over the bars: a bout across a gap has no bar there
-        edgecolor=MUTED,
-        linewidth=0.0,
-        hatch="//////",
-        zorder=1.5,
-        gid="no pose",
-    )
+    draw(animal.lost_s, (-0.5, max(len(words), 1)), "no pose")
     for k, (word, colour) in enumerate(action_colours(words).items()):
         own = bouts.loc[bouts["action"] == word, ["start_s", "stop_s"]].to_numpy(float)
-        axes.broken_barh(
-            [(a / size, max(b - a, least) / size) for a, b in within(own)],
-            (k - 0.38, 0.76),
-            facecolor=colour,
-            gid=f"bouts of {word}",
-        )
-    axes.set_ylim(max(len(words), 1) - 0.5, -0.5)
-    axes.set_yticks(range(len(words)), [word.replace("_", " ") for word in words])
-    axes.tick_params(axis="y", length=0)
+        draw(own, (k - 0.38, 0.76), f"bouts of {word}", colour)
+    name_rows(axes, [word.replace("_", " ") for word in words], least=1)
     _clock(axes, (first_s, last_s))
     return figure
 
 
 def curves(
-    seen: Seen, span_s: Span | None = None, width_mm: float = TWO_COLUMNS_MM
+    animal: SessionAnimal, span_s: Span | None = None, width_mm: float = TWO_COLUMNS_MM
 ) -> Figure | None:
     """The measures and the expected error over time; None without any pose.
 
     Args:
-        seen: the animal.
+        animal: the animal.
         span_s: the displayed stretch, s; None shows the whole session.
         width_mm: width of the figure, mm.
     """
-    first_s, last_s = span_s or (0.0, seen.duration_s)
-    error = seen.broken(seen.frames["predicted_error_mm"])
-    n = int(seen.frames["predicted_error_mm"].notna().sum())
+    first_s, last_s = span_s or (0.0, animal.duration_s)
+    error = animal.frames["predicted_error_mm"]
+    n = int(error.notna().sum())
     rows: list[tuple[str, str, Array, str, bool]] = []
-    for one in drawn_curves(seen):
-        values, unit = shown(seen.column(one.column), one.unit)
+    for one in drawn_curves(animal):
+        values, unit = shown(animal.column(one.column), one.unit)
         rows.append((f"{one.title} {one.what}", unit, values, one.colour, one.from_zero))
-    rows.append(("Predicted error of a joint", "mm", error, PREDICTED_ERROR, True))
+    rows.append(("Predicted error of a joint", "mm", animal.broken(error), PREDICTED_ERROR, True))
     if not any(np.isfinite(values).any() for _, _, values, _, _ in rows):
         return None
     step = _CURVE_MM + 6.0
     figure = sheet(width_mm, len(rows) * step + 8.0)
     width = width_mm - LEFT_MM - RIGHT_MM
-    time_s = seen.frames["time_s"].to_numpy(float)
+    time_s = animal.frames["time_s"].to_numpy(float)
     near = slice(*np.searchsorted(time_s, [first_s - _BESIDE_S, last_s + _BESIDE_S]))
     _, size = time_unit(last_s - first_s)
-    rearing = seen.bouts["action"].astype(str).str.startswith("rear")
-    rears = seen.bouts.loc[rearing, ["start_s", "stop_s", "action"]].to_numpy()
-    colours = action_colours(seen.words)
+    rearing = animal.bouts["action"].astype(str).str.startswith("rear")
+    rears = animal.bouts.loc[rearing, ["start_s", "stop_s", "action"]].to_numpy()
+    colours = action_colours(animal.words)
     for k, (title, unit, values, colour, from_zero) in enumerate(rows):
         axes = panel(figure, LEFT_MM, 8.0 + (len(rows) - 1 - k) * step, width, _CURVE_MM)
         if " height above the floor" in title and len(rears):
@@ -141,78 +128,73 @@ def curves(
                 shade = colours.get(str(word), MUTED)
                 axes.axvspan(a / size, b / size, color=shade, alpha=0.3, linewidth=0.0)
         axes.set_title(
-            f"{title}, {seen.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
+            f"{title}, {animal.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
         kept = kept_rows(values[near], _MOST_COLUMNS)
         marker = "" if span_s is None or len(kept) > _MOST_DOTS else "o"
         axes.plot(
             time_s[near][kept] / size, values[near][kept], color=colour, marker=marker, markersize=1
         )
-        axes.set_ylabel(unit)
+        low = float(np.nanmin(values, initial=0.0)) if from_zero else None
+        axes.set(ylabel=unit, ylim=(low, None))
         axes.grid(axis="y", color=LINE, linewidth=0.4)
         _clock(axes, (first_s, last_s), last=k == len(rows) - 1)
-        if from_zero:
-            axes.set_ylim(bottom=float(np.nanmin(values, initial=0.0)))
     return figure
 
 
-def cumulative_distance(seen: Seen) -> Figure | None:
+def cumulative_distance(animal: SessionAnimal) -> Figure | None:
     """The cumulative distance of the animal; None without a known step."""
-    known = seen.kinematics is not None and np.isfinite(seen.column("step_mm")).any()
-    if not known or seen.kinematics is None:
+    if not np.isfinite(animal.column("step_mm")).any():
         return None
-    time_s, metres, n = walked(seen)
-    _, size = time_unit(seen.duration_s)
+    time_s, metres, n = walked(animal)
+    _, size = time_unit(animal.duration_s)
     figure = sheet(ONE_COLUMN_MM, 52.0)
     axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
     axes.set_title(
-        f"Cumulative distance, {seen.who}\n{metres[-1]:.2f} m, n = {counted(n, 'frame')}"
+        f"Cumulative distance, {animal.who}\n{metres[-1]:.2f} m, n = {counted(n, 'frame')}"
     )
     rows = kept_rows(metres, _MOST_COLUMNS)
     axes.plot(time_s[rows] / size, metres[rows], color=BLUE, linewidth=1.0)
-    axes.set_ylabel("distance, m")
-    axes.set_ylim(bottom=0.0)
-    _clock(axes, (0.0, seen.duration_s))
+    axes.set(ylabel="distance, m", ylim=(0.0, None))
+    _clock(axes, (0.0, animal.duration_s))
     return figure
 
 
-def walked(seen: Seen) -> tuple[Array, Array, int]:
+def walked(animal: SessionAnimal) -> tuple[Array, Array, int]:
     """Times (n,) s, cumulative distance (n,) m, and the number of frames with a speed.
 
     The animal must have kinematics.
     """
-    assert seen.kinematics is not None
-    step = seen.kinematics["step_mm"].to_numpy(float)
+    assert animal.kinematics is not None
+    step = animal.kinematics["step_mm"].to_numpy(float)
     n = int(np.isfinite(step).sum())
-    time_s = seen.kinematics["time_s"].to_numpy(float)
+    time_s = animal.kinematics["time_s"].to_numpy(float)
     return time_s, np.cumsum(np.nan_to_num(step)) / 1000.0, n
 
 
-def speed_distribution(seen: Seen) -> Figure | None:
+def speed_distribution(animal: SessionAnimal) -> Figure | None:
     """Share of the observed time at each speed; None if unknown."""
-    if seen.kinematics is None or "speed_mm_s" not in seen.kinematics:
+    if animal.kinematics is None or "speed_mm_s" not in animal.kinematics:
         return None
-    values, unit = shown(seen.kinematics["speed_mm_s"].to_numpy(float), "mm/s")
-    return distribution("Speed", seen, values, seen.hold_s, unit, BLUE)
+    values, unit = shown(animal.kinematics["speed_mm_s"].to_numpy(float), "mm/s")
+    return distribution("Speed", animal, values, animal.hold_s, unit, BLUE)
 
 
-def error_distribution(seen: Seen) -> Figure | None:
+def error_distribution(animal: SessionAnimal) -> Figure | None:
     """Share of the observed time at each predicted error; None if unknown."""
-    from liex_lab.behaviour.activity import hold_times
-
-    values = seen.frames["predicted_error_mm"].to_numpy(float)
-    hold = hold_times(seen.frames["time_s"].to_numpy(float))
-    return distribution("Predicted error of a joint", seen, values, hold, "mm", PREDICTED_ERROR)
+    values = animal.frames["predicted_error_mm"].to_numpy(float)
+    hold = hold_times(animal.frames["time_s"].to_numpy(float))
+    return distribution("Predicted error of a joint", animal, values, hold, "mm", PREDICTED_ERROR)
 
 
 def distribution(
-    title: str, seen: Seen, values: Array, hold_s: Array, unit: str, colour: str
+    title: str, animal: SessionAnimal, values: Array, hold_s: Array, unit: str, colour: str
 ) -> Figure | None:
     """Histogram of values over the range of 99 % of them; a line marks the median.
 
     Args:
         title: name of the values.
-        seen: the animal.
+        animal: the animal.
         values: (n,) not negative; NaN is left out, and values above the 99 % quantile count in the
             last bin.
         hold_s: (n,) duration of each, s.
@@ -233,12 +215,12 @@ def distribution(
     share = 100.0 * share / max(share.sum(), 1e-9)
     figure = sheet(ONE_COLUMN_MM, 52.0)
     axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
-    axes.set_title(f"{title}, {seen.who}\nn = {counted(len(values), 'frame')}")
+    axes.set_title(f"{title}, {animal.who}\nn = {counted(len(values), 'frame')}")
     axes.bar(edges[:-1], share, np.diff(edges), align="edge", color=colour, gid="distribution")
     median = float(np.median(values))
     axes.axvline(median, color=INK, linewidth=0.7, linestyle=(0, (3, 2)))
     right = median > 0.6 * top
-    text = axes.annotate(
+    label = axes.annotate(
         f"median {median:.2f} {unit}",
         (median, 0.96),
         (-3 if right else 3, 0),
@@ -248,27 +230,9 @@ def distribution(
         va="top",
         size=6.0,
     )
-    halo(text)
-    axes.set_xlim(0.0, top)
-    axes.set_xlabel(unit)
-    axes.set_ylabel("share of the time, %")
+    halo(label)
+    axes.set(xlim=(0.0, top), xlabel=unit, ylabel="share of the time, %")
     return figure
-
-
-def joined(spans: Sequence[tuple[float, float]], least_s: float) -> list[tuple[float, float]]:
-    """Spans in order; spans closer than `least_s` are joined, up to 40 times that length.
-
-    Args:
-        spans: start and stop of each, s, in order.
-        least_s: least distance of separate spans, s.
-    """
-    out: list[tuple[float, float]] = []
-    for start, stop in spans:
-        if out and start - out[-1][1] < least_s and stop - out[-1][0] < 40 * least_s:
-            out[-1] = (out[-1][0], stop)
-        else:
-            out.append((start, stop))
-    return out
 
 
 def kept_rows(y: Array, n_columns: int) -> NDArray[np.int64]:
@@ -305,3 +269,234 @@ def _clock(axes: Axes, span_s: Span, last: bool = True) -> None:
         axes.set_xlabel(f"time, {unit}")
     else:
         axes.tick_params(axis="x", labelbottom=False)
+
+
+# By action
+
+CERTAIN = 0.05  # level of the corrected p
+_MORE = BLUE
+_LESS = "#d55e00"
+_AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz", "opening")
+_BESIDE = 4  # panels per row
+
+
+def time_budget(animal: SessionAnimal) -> Figure | None:
+    """Share of the observed time in each action and unlabelled; None without actions."""
+    row = animal.summary
+    colours = {**action_colours(animal.words), "unlabelled": UNLABELLED_COLOUR}
+    words = [word for word in colours if row is not None and f"{word}_share" in row]
+    if row is None or not words or not np.isfinite([row[f"{word}_share"] for word in words]).any():
+        return None
+    shares = np.nan_to_num([100.0 * float(row[f"{word}_share"]) for word in words])
+    n_bouts = [int(row[f"{word}_count"]) if f"{word}_count" in row else None for word in words]
+    figure = sheet(ONE_COLUMN_MM, 4.0 * len(words) + 22.0)
+    axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - 12.0, 4.0 * len(words))
+    heading(figure, f"Time budget, {animal.who}\nn = {counted(len(animal.bouts), 'bout')}")
+    axes.barh(range(len(words)), shares, 0.76, color=[colours[word] for word in words])
+    for k, (share, n) in enumerate(zip(shares, n_bouts, strict=True)):
+        count = "" if n is None else f"n = {n}"
+        how = {"textcoords": "offset points", "va": "center", "size": 5.5, "color": MUTED}
+        axes.annotate(count, (share, k), (2, 0), **how)
+    name_rows(axes, [word.replace("_", " ") for word in words])
+    most = max(1.05 * float(shares.max()), 1.0)
+    axes.set(xlim=(0.0, most), xlabel="share of the observed time, %")
+    return figure
+
+
+def activity(animal: SessionAnimal) -> Figure | None:
+    """Stacked shares of the observed time in each action per interval; None without actions.
+
+    Sessions of schema 7 and earlier counted lost frames in bouts; their shares are scaled to one.
+    """
+    table = animal.table("activity")
+    if table is None or not len(table):
+        return None
+    colours = action_colours(animal.words)
+    words = [word for word in colours if f"{word}_s" in table]
+    start, stop, observed = (
+        table[name].to_numpy(float) for name in ("start_s", "stop_s", "observed_s")
+    )
+    if not words or not observed.sum() > 0:
+        return None
+    unit, size = time_unit(float(stop[-1]))
+    spent = {word: table[f"{word}_s"].to_numpy(float) for word in words}
+    total = np.maximum(observed, np.sum([*spent.values()], axis=0))
+    spent["unlabelled"] = total - np.sum([*spent.values()], axis=0)
+    colours["unlabelled"] = UNLABELLED_COLOUR
+    present = [word for word, seconds in spent.items() if seconds.sum() > 1e-6]
+    low = 9.0 + 4.0 * key_rows(present)
+    figure = sheet(TWO_COLUMNS_MM, low + 31.0)
+    axes = panel(figure, LEFT_MM, low, TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM, 23.0)
+    axes.set_title(
+        f"Shares over the session, {animal.who}, n = {counted(len(table), 'interval')} of "
+        f"{stop[0] - start[0]:.3g} s"
+    )
+    below = np.zeros(len(table))
+    for word, seconds in spent.items():
+        share = np.divide(seconds, total, out=np.zeros(len(table)), where=observed > 0)
+        if share.any():
+            axes.bar(
+                start / size,
+                100.0 * share,
+                0.985 * (stop - start) / size,
+                100.0 * below,
+                align="edge",
+                color=colours[word],
+                gid=f"share of {word}",
+            )
+        below += share
+    axes.set(xlim=(0.0, float(stop[-1]) / size), ylim=(0.0, 100.0))
+    axes.set(xlabel=f"time, {unit}", ylabel="%")
+    action_key(figure, {word: colours[word] for word in present})
+    return figure
+
+
+def transitions(animal: SessionAnimal) -> Figure | None:
+    """Transitions as matrix and graph, compared with chance; None with fewer than two actions."""
+    table = animal.table("transitions")
+    if table is None:
+        return None
+    words = [
+        word
+        for word in animal.words
+        if (table.loc[table["from_action"] == word, "n_from"] > 0).any()
+        or (table.loc[table["to_action"] == word, "n"] > 0).any()
+    ]
+    if len(words) < 2:
+        return None
+    found = {  # (k, k) from the row's word to the column's; NaN if absent
+        name: table.pivot(index="from_action", columns="to_action", values=name)
+        .reindex(index=words, columns=words)
+        .to_numpy(float)
+        for name in ("n", "probability", "by_chance", "p_fdr")
+    }
+    side = min(68.0, 16.0 * len(words))
+    wide = 68.0
+    figure = sheet(TWO_COLUMNS_MM, wide + 14.0 + (18.0 if side == wide else 0.0))
+    _matrix(panel(figure, LEFT_MM - 1.0, 4.0 + 0.4 * (wide - side), side, side), words, found)
+    left = LEFT_MM + wide + 2.0  # as wide as possible, for the names around the circle
+    graph = panel(figure, left, 4.0, TWO_COLUMNS_MM - 1.0 - left, wide - 6.0)
+    _graph(graph, words, found, action_colours(animal.words))
+    n = int(np.nansum(found["n"]))
+    heading(
+        figure,
+        f"Transitions, {animal.who}, n = {counted(n, 'transition')}; percentage of transitions out "
+        "of each row\n(in brackets: expected by chance); blue: more, orange: less often than "
+        f"chance (corrected p ≤ {CERTAIN:g})",
+    )
+    return figure
+
+
+def _against_chance(found: dict[str, Array], i: int, j: int) -> str:
+    """The colour of a pair: significantly more or less often than chance, or neither."""
+    if not found["p_fdr"][i, j] <= CERTAIN:
+        return MUTED
+    return _MORE if found["probability"][i, j] > found["by_chance"][i, j] else _LESS
+
+
+def _matrix(axes: Axes, words: list[str], found: dict[str, Array]) -> None:
+    """A square for each pair, with opacity by probability, and share and chance in %."""
+    k = len(words)
+    small = 5.5 if k <= 7 else 4.2
+    for (i, j), p in np.ndenumerate(found["probability"]):
+        known = i != j and np.isfinite(p)
+        fill = (_against_chance(found, i, j), 0.05 + 0.5 * p) if known else SOFT
+        axes.add_patch(Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, facecolor=fill, linewidth=0.0))
+        if known:
+            text = f"{100 * p:.0f}\n({100 * found['by_chance'][i, j]:.0f})"
+            axes.text(j, i, text, ha="center", va="center", size=small, linespacing=1.25)
+    names = [word.replace("_", " ") for word in words]
+    counts = np.nansum(found["n"], axis=1).astype(int)
+    axes.set(xlim=(-0.5, k - 0.5), ylim=(k - 0.5, -0.5))
+    axes.set_yticks(
+        range(k), [f"{name}\nn = {n}" for name, n in zip(names, counts, strict=True)], size=5.5
+    )
+    axes.set_xticks(range(k), names, rotation=40, ha="left", size=5.5)
+    axes.tick_params(length=0, top=False, labeltop=True, bottom=False, labelbottom=False)
+    axes.spines[:].set_visible(False)
+
+
+def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[str, str]) -> None:
+    """Actions on a circle, with area by frequency; arrows with width by probability."""
+    k = len(words)
+    angle = np.pi / 2 - 2.0 * np.pi * np.arange(k) / k
+    place = np.column_stack([np.cos(angle), np.sin(angle)])
+    counts = np.nansum(found["n"], axis=1) + np.nansum(found["n"], axis=0)
+    size = 40.0 + 260.0 * counts / max(float(counts.max()), 1.0)
+    for (i, j), p in np.ndenumerate(found["probability"]):
+        if i != j and found["n"][i, j] > 0:
+            arrow = FancyArrowPatch(
+                (place[i, 0], place[i, 1]),
+                (place[j, 0], place[j, 1]),
+                connectionstyle="arc3,rad=0.14",
+                arrowstyle="-|>",
+                mutation_scale=4.0 + 4.0 * p,
+                shrinkA=0.55 * np.sqrt(size[i]),
+                shrinkB=0.55 * np.sqrt(size[j]),
+                linewidth=0.3 + 3.0 * p,
+                color=_against_chance(found, i, j),
+                alpha=0.85,
+            )
+            axes.add_patch(arrow)
+    axes.scatter(
+        place[:, 0],
+        place[:, 1],
+        s=size,
+        c=[colours[word] for word in words],
+        edgecolors=PAPER,
+        zorder=3,
+    )
+    for word, (x, y) in zip(words, place, strict=True):
+        text = word.replace("_", " ")
+        across = "left" if x > 0.1 else "right" if x < -0.1 else "center"
+        up = "bottom" if y > 0.1 else "top" if y < -0.1 else "center"
+        axes.text(1.14 * x, 1.14 * y, text, ha=across, va=up, size=6.0)
+    axes.set(xlim=(-1.96, 1.96), ylim=(-1.41, 1.41), aspect="equal")
+    axes.set_axis_off()
+
+
+def aligned_curves(animal: SessionAnimal) -> Figure | None:
+    """Median and quartiles of measures around the onsets of actions; None with too few bouts."""
+    rows = _onsets(animal)
+    if not rows:
+        return None
+    colours = action_colours(animal.words)
+    side = (TWO_COLUMNS_MM - 4.0) / _BESIDE
+    lines = -(-len(rows) // _BESIDE)
+    figure = sheet(TWO_COLUMNS_MM, lines * 33.0 + 9.0)
+    top = {
+        title: max(float(np.nanmax(one.high)) for other, _, _, one in rows if other == title)
+        for title, _, _, _ in rows
+    }
+    for k, (title, unit, word, one) in enumerate(rows):
+        line, column = divmod(k, _BESIDE)
+        axes = panel(
+            figure, 11.0 + column * side, 9.0 + (lines - 1 - line) * 33.0, side - 13.0, 20.0
+        )
+        colour = colours[word]
+        axes.fill_between(one.time_s, one.low, one.high, color=colour, alpha=0.3, linewidth=0.0)
+        axes.plot(one.time_s, one.median, color=colour, linewidth=1.1)
+        axes.axvline(0.0, color=INK, linewidth=0.6, linestyle=(0, (3, 2)))
+        axes.set(xlim=(one.time_s[0], one.time_s[-1]), ylim=(0.0, 1.05 * top[title] or 1.0))
+        axes.grid(axis="y", color=LINE, linewidth=0.4)
+        axes.set_title(f"{word.replace('_', ' ')}, n = {one.n}", size=6.5)
+        axes.set_ylabel(f"{title.lower()}, {unit}")
+        if line == lines - 1 or k + _BESIDE >= len(rows):
+            axes.set_xlabel("time from the onset, s")
+    heading(figure, f"About the onsets, {animal.who}: median and quartiles over the bouts")
+    return figure
+
+
+def _onsets(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
+    """(measure, unit, word, curves) of every action with enough bouts, in the displayed unit."""
+    found: list[tuple[str, str, str, Around]] = []
+    for curve in (one for one in drawn_curves(animal) if one.column in _AROUND):
+        for word in animal.words:
+            if curve.column == "nose_height_mm" and not word.startswith("rear"):
+                continue  # constant without rearing
+            one = around_onsets(animal.kinematics, animal.bouts, word, curve.column)
+            if one is not None:
+                three = (shown(some, curve.unit)[0] for some in (one.low, one.median, one.high))
+                unit = shown(1.0, curve.unit)[1]
+                found.append((curve.title, unit, word, Around(one.time_s, *three, one.n)))
+    return found

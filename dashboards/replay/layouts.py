@@ -8,10 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
-from liex_lab.behaviour.body import DrawnMeasure, drawn_measures
-from liex_lab.runtime.durable import replacing
+from liex_lab.behaviour.body import drawn_measures
+from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.sessions import Session
+from liex_lab.sessions.cutouts import ALL, ANIMAL, N_BOXES, N_WINDOWS, NONE
+from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
+from liex_lab.sessions.rrd_scene import CUTOUTS, cutout_entity, cutout_frame
+from liex_lab.sessions.viewer import ERROR
 
 BLUEPRINT_FILE = "replay.rbl"
 
@@ -32,107 +38,14 @@ def live_blueprint(body_m: float) -> Any:
 
     `body_m` is the length of the animal's body, m.
     """
-    import rerun.blueprint as rrb
-
-    from liex_lab.sessions.rrd import SKELETON
-    from liex_lab.sessions.viewer import ERROR
-
-    picture = rrb.Spatial2DView(
+    image = rrb.Spatial2DView(
         origin="arena/camera/image",
         contents=["$origin/**", f"+ /{SKELETON}/**"],
         name="depth with the skeleton",
     )
-    scene = rrb.Spatial3DView(
-        origin="arena",
-        name="3D: the animal, followed (metres)",
-        eye_controls=_followed(body_m, SKELETON),
-        line_grid=rrb.LineGrid3D(visible=False),
-    )
     error = rrb.TimeSeriesView(origin=ERROR, name="predicted error (mm)")
-    return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(scene, picture), error, row_shares=[4, 1]),
-        rrb.TimePanel(timeline="time", state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-    )
-
-
-def _followed(body_m: float, skeleton: str) -> Any:
-    """The view that follows an animal of length `body_m` by its skeleton's entity."""
-    import rerun.blueprint as rrb
-
-    return rrb.EyeControls3D(
-        kind=rrb.Eye3DKind.Orbital,
-        position=body_m * np.array([0.8, -2.6, 2.2]),
-        look_target=[0.0, 0.0, 0.0],
-        eye_up=[0.0, 0.0, 1.0],
-        tracking_entity=f"/{skeleton}/joints",
-    )
-
-
-def _zoomed(skeleton: str) -> Any:
-    """The cut-out around the animal with its skeleton's entity; its camera follows the animal."""
-    import rerun.blueprint as rrb
-
-    from liex_lab.sessions.rrd_scene import CUTOUTS
-
-    return rrb.Spatial2DView(
-        origin=f"{CUTOUTS}/1",
-        contents=["$origin/**", f"+ /{skeleton}/**"],
-        name="the animal, zoomed",
-    )
-
-
-def _in_picture() -> Any:
-    """The coordinate frames of the cut-outs in the image, by their entities."""
-    import rerun as rr
-
-    from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS
-    from liex_lab.sessions.rrd_scene import cutout_entity, cutout_frame
-
-    return {
-        cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
-        for k in range(N_BOXES)
-        for which in range(N_WINDOWS)
-    }
-
-
-def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, Any]:
-    """The lanes of actions, and the curves below them with the list of messages.
-
-    Args:
-        at: the entity to show for a measured one.
-        animal: the section of that name of session.json; its joints determine the curves.
-    """
-    import rerun.blueprint as rrb
-
-    lanes = rrb.StateTimelineView(
-        origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
-    )
-    shown = drawn_measures(animal)
-    curves = rrb.Horizontal(
-        *(
-            rrb.TimeSeriesView(
-                origin=at(one.entity),
-                contents=["$origin/**", f"+ /{at(one.entity_before)}"],
-                name=_called(one),
-            )
-            for one in shown
-        ),
-        rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),
-        rrb.TextLogView(
-            origin="log",
-            name="what to look at: click to jump there",
-            columns=rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["body"]),
-        ),
-        column_shares=[*(2.0 for _ in shown), 2.0, 2.4],
-    )
-    return lanes, curves
-
-
-def _called(curve: DrawnMeasure) -> str:
-    """Name of a curve's view."""
-    return f"{curve.title.lower()} {curve.what}".split(";")[0].split(",")[0]
+    scene = _scene(body_m, SKELETON)
+    return _blueprint(rrb.Vertical(rrb.Horizontal(scene, image), error, row_shares=[4, 1]))
 
 
 def replay_blueprint(session: dict[str, Any]) -> Any:
@@ -144,81 +57,123 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     Args:
         session: the content of session.json.
     """
-    import rerun.blueprint as rrb
-
-    from liex_lab.sessions.cutouts import ALL, ANIMAL, NONE
-    from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
-    from liex_lab.sessions.rrd_scene import CUTOUTS
-
-    # with corrections, the original entities are hidden in the views but remain in the
-    # replay
+    animal = session["animal"]
     corrected = bool(session.get("corrections"))
     at = corrected_entity if corrected else str
     measured = ["skeleton", "body", "uncertainty", "root"] if corrected else []
-    body_m = (
-        float(session["animal"].get("spine_mm") or session["animal"]["home_length_mm"]) / 1000.0
-    )
-    scene = rrb.Spatial3DView(
-        origin="arena",
-        contents=[
-            "$origin/**",
-            f"- /{OVERLAY}/**",
-            f"- /{corrected_entity(OVERLAY)}/**",
-            *(f"- /arena/{name}/**" for name in measured),
-        ],
-        name="3D: the animal, followed (metres)",
-        eye_controls=_followed(body_m, at(SKELETON)),
-        line_grid=rrb.LineGrid3D(visible=False),
-    )
+    body_m = float(animal.get("spine_mm") or animal["home_length_mm"]) / 1000.0
+    hidden = [OVERLAY, corrected_entity(OVERLAY), *(f"arena/{name}" for name in measured)]
+    scene = _scene(body_m, at(SKELETON), ["$origin/**", *(f"- /{name}/**" for name in hidden)])
     kept = session.get("plan", {}).get("replay", {}).get("depth")
-    picture = rrb.Spatial2DView(
+    # the coordinate frames of the cut-outs in the image, by their entities
+    frames = {
+        cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
+        for k in range(N_BOXES)
+        for which in range(N_WINDOWS)
+    }
+    image = rrb.Spatial2DView(
         origin="arena/camera/image",
         contents=[
             "$origin/**",
             f"+ /{CUTOUTS}/**",
             *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected),
         ],
-        overrides={} if kept in (ALL, NONE) else _in_picture(),
+        overrides={} if kept in (ALL, NONE) else frames,
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
-    beside = rrb.Vertical(_zoomed(at(SKELETON)), picture) if kept == ANIMAL else picture
-    lanes, curves = _over_time(at, session["animal"])
+    if kept == ANIMAL:  # above it, a view whose camera follows the animal
+        zoomed = rrb.Spatial2DView(
+            origin=f"{CUTOUTS}/1",
+            contents=["$origin/**", f"+ /{at(SKELETON)}/**"],
+            name="the animal, zoomed",
+        )
+        image = rrb.Vertical(zoomed, image)
+    above = rrb.Horizontal(scene, image)
+    return _blueprint(rrb.Vertical(above, *_over_time(at, animal), row_shares=[5, 1.6, 2]))
+
+
+def _blueprint(views: Any) -> Any:
     return rrb.Blueprint(
-        rrb.Vertical(rrb.Horizontal(scene, beside), lanes, curves, row_shares=[5, 1.6, 2]),
+        views,
         rrb.TimePanel(timeline="time", state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
 
 
-# Foxglove layout (JSON) of a session's MCAP file, for import in Foxglove.
+def _scene(body_m: float, skeleton: str, contents: Any = "$origin/**") -> Any:
+    """The 3D view that follows an animal of length `body_m` by its skeleton's entity."""
+    return rrb.Spatial3DView(
+        origin="arena",
+        contents=contents,
+        name="3D: the animal, followed (metres)",
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=body_m * np.array([0.8, -2.6, 2.2]),
+            look_target=[0.0, 0.0, 0.0],
+            eye_up=[0.0, 0.0, 1.0],
+            tracking_entity=f"/{skeleton}/joints",
+        ),
+        line_grid=rrb.LineGrid3D(visible=False),
+    )
+
+
+def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, Any]:
+    """The lanes of actions, and the curves below them with the list of messages.
+
+    Args:
+        at: the entity to show for a measured one.
+        animal: the section of that name of session.json; its joints determine the curves.
+    """
+    lanes = rrb.StateTimelineView(
+        origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
+    )
+    shown = drawn_measures(animal)
+    curves = rrb.Horizontal(
+        *(
+            rrb.TimeSeriesView(
+                origin=at(one.entity),
+                contents=["$origin/**", f"+ /{at(one.entity_before)}"],
+                name=f"{one.title.lower()} {one.what}".split(";")[0].split(",")[0],
+            )
+            for one in shown
+        ),
+        rrb.TimeSeriesView(origin=at("error/predicted"), name="predicted error"),
+        rrb.TextLogView(
+            origin="log",
+            name="what to review: click to jump there",
+            columns=rrb.TextLogColumns(timeline_columns=["time"], text_log_columns=["body"]),
+        ),
+        column_shares=[*(2.0 for _ in shown), 2.0, 2.4],
+    )
+    return lanes, curves
+
+
+# Foxglove layout (JSON) of a session's MCAP file, for import in Foxglove
 
 
 LAYOUT_FILE = "foxglove.json"
+_EMPTY_LAYOUT = Path(__file__).parent / LAYOUT_FILE  # scene and depth above, the rest below
 
 
 def write_layout(session: Session) -> Path:
     """Write foxglove.json to a session's folder; returns its path."""
-    from liex_lab.runtime.durable import write_whole
-
     path = session.path / LAYOUT_FILE
     write_whole(path, json.dumps(foxglove_layout(session.metadata), indent=1) + "\n")
     return path
 
 
 def foxglove_layout(about: dict[str, Any]) -> dict[str, Any]:
-    """The layout of foxglove.json: scene and depth above, actions, heights and messages below.
+    """The layout: scene and depth above, actions, heights and messages below.
 
     Args:
         about: the content of session.json.
     """
-    layout: dict[str, Any] = json.loads(
-        Path(__file__).with_name(LAYOUT_FILE).read_text(encoding="utf-8")
-    )
+    layout: dict[str, Any] = json.loads(_EMPTY_LAYOUT.read_text(encoding="utf-8"))
     panels = layout["configById"]
     far_mm = float(about["camera"]["floor_distance_mm"])
-    depth_range = {"minValue": round(0.85 * far_mm), "maxValue": round(1.02 * far_mm)}
-    panels["Image!depth"]["imageMode"] |= depth_range
+    depth_mm = {"minValue": round(0.85 * far_mm), "maxValue": round(1.02 * far_mm)}
+    panels["Image!depth"]["imageMode"] |= depth_mm
     joints = list(about["animal"]["joints"])
     ends = sorted({0, len(joints) - 1} if about["animal"]["name"] != "hand" else {0})
     panels["Plot!heights"]["paths"] = [

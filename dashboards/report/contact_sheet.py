@@ -1,4 +1,4 @@
-"""The report's contact sheet: depth images with scene and skeleton over them, as SVG.
+"""Depth images of a session with scene and skeleton over them, as SVG: contact sheet, whole image.
 
 An image is a PNG of a few pixels inside an SVG, so that the skeleton stays sharp. Drawn lengths are
 in units of the SVG's viewBox.
@@ -10,14 +10,22 @@ import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
+import cv2
 import numpy as np
+from matplotlib import colormaps
 from numpy.typing import NDArray
 
+from liex_lab.actions.vocabulary import action_colours
+from liex_lab.errors import SessionError
 from liex_lab.scene.scene import Fixture
 from liex_lab.sessions import Session
 
-Array = NDArray[np.float64]
+from ..figures.animals import Array, read_cutout
+from ..figures.places import hidden_places, in_image
+from ..video.relief import Relief, scale_mm
+
 _MOST_HIDDEN = 24  # hiding positions to mark, the longest first
 REGION = "region"
 OUTLINE = "outline"
@@ -25,24 +33,22 @@ FIXTURE = "fixture"
 HIDDEN = "hidden"
 BESIDE = "beside"
 WORDS = {
-    REGION: "region outside of which nothing is looked at",
+    REGION: "region outside of which nothing is analysed",
     OUTLINE: "walls that were found",
     FIXTURE: "fixture, with its height",
     HIDDEN: "where an animal hid, and when",
     BESIDE: "another animal in view",
 }
 # colour and dashes (in widths of the line) of each
-_LOOKS = {
+_STYLES = {
     REGION: ("#fff", "1 2.5"),
     OUTLINE: ("#fff", ""),
     FIXTURE: ("#ffd24a", ""),
     HIDDEN: ("#ff8ad4", ""),
     BESIDE: ("#ffd24a", "2 1.5"),
 }
-
-
-# offset of a label from its point, in line widths
-_BESIDE_IT = {BESIDE: (16.0, 2.0)}
+_MOST_PX = 320  # per side: twice the widest display
+_UNREAD = 90  # grey
 
 
 @dataclass(frozen=True)
@@ -52,42 +58,30 @@ class Mark:
     Attributes:
         kind: region, outline, fixture, hidden or beside.
         points_px: (n, 2) corners of a closed line, or one point, px of the whole image.
-        said: the label of a point.
+        label: the label of a point.
     """
 
     kind: str
     points_px: Array
-    said: str = ""
+    label: str = ""
 
 
 def scene_marks(session: Session) -> list[Mark]:
     """The scene of a session in image coordinates; objects that were not found are left out."""
     scene = session.metadata.get("scene") or {}
-    made = [Mark(REGION, np.array(scene.get("region_px") or np.empty((0, 2)), float))]
-    made.append(Mark(OUTLINE, _in_picture(session, session.arena.outline_mm())))
+    region = Mark(REGION, np.array(scene.get("region_px") or np.empty((0, 2)), float))
+    outline = Mark(OUTLINE, in_image(session, session.arena.outline_mm()))
+    made = [mark for mark in (region, outline) if len(mark.points_px) >= 3]
     for fixture in map(Fixture.from_dict, scene.get("fixtures") or []):
-        place = _in_picture(session, np.array([fixture.centre_mm]), fixture.height_mm)
-        made.append(Mark(FIXTURE, place, str(fixture)))
-    gaps = session.gaps
-    if "x_mm" not in gaps:  # of earlier versions
-        gaps = gaps.assign(x_mm=np.nan, y_mm=np.nan)
-    hidden = gaps[(gaps["reason"] == "hidden") & gaps["x_mm"].notna()]
-    columns = hidden[["x_mm", "y_mm", "start_s", "stop_s"]].to_numpy(float)
-    longest = np.argsort(columns[:, 2] - columns[:, 3], kind="stable")[:_MOST_HIDDEN]
-    for x, y, start, stop in columns[np.sort(longest)]:
-        place = _in_picture(session, np.array([[x, y]]))
-        made.append(Mark(HIDDEN, place, f"{start:.1f} to {stop:.1f} s"))
-    least = {REGION: 3, OUTLINE: 3, FIXTURE: 1, HIDDEN: 1}
-    return [one for one in made if len(one.points_px) >= least[one.kind]]
-
-
-def _in_picture(session: Session, xy_mm: Array, height_mm: float = 0.0) -> Array:
-    """Positions (n, 2) mm above the floor -> (n, 2) px; empty if any is behind the camera."""
-    if not len(xy_mm):
-        return np.empty((0, 2))
-    place = np.column_stack([xy_mm, np.full(len(xy_mm), height_mm)])
-    seen = session.camera.project(session.T_arena_camera.inverse() @ place)
-    return seen if np.isfinite(seen).all() else np.empty((0, 2))
+        centre = in_image(session, np.array([fixture.centre_mm]), fixture.height_mm)
+        made.append(Mark(FIXTURE, centre, str(fixture)))
+    hidden = hidden_places(session)
+    longest = np.argsort(hidden[:, 2] - hidden[:, 3], kind="stable")[:_MOST_HIDDEN]
+    for x, y, start, stop in hidden[np.sort(longest)]:
+        made.append(
+            Mark(HIDDEN, in_image(session, np.array([[x, y]])), f"{start:.1f} to {stop:.1f} s")
+        )
+    return [mark for mark in made if len(mark.points_px)]
 
 
 def svg_marks(
@@ -111,69 +105,52 @@ def svg_marks(
         lettered: whether to write a mark's label; its tooltip is always included.
     """
     parts = []
-    for one in marks:
+    for mark in marks:
         # SVG counts from the image's corner, we count from a pixel's centre
-        points = one.points_px - [left, top] + 0.5
+        points = mark.points_px - [left, top] + 0.5
         if (points.max(axis=0) < 0).any() or (points.min(axis=0) > [width, height]).any():
             continue
-        colour, dashes = _LOOKS[one.kind]
+        colour, dashes = _STYLES[mark.kind]
         of = " ".join(f"{0.8 * unit * float(part):.2f}" for part in dashes.split())
         dashed = f' stroke-dasharray="{of}"' if of else ""
-        name, path = _shape(one.kind, points, 1.8 * unit)
-        told = escape(f"{WORDS[one.kind]} {one.said}".strip())
+        name, path = _shape(mark.kind, points, 1.8 * unit)
         parts.append(
             f'<{name} {path} fill="none" stroke="#000" stroke-opacity="0.5" '
             f'stroke-width="{1.8 * unit:.2f}"/>'
-            f'<{name} {path} class="{one.kind}" fill="none" stroke="{colour}" '
-            f'stroke-width="{0.8 * unit:.2f}"{dashed}><title>{told}</title></{name}>'
+            f'<{name} {path} class="{mark.kind}" fill="none" stroke="{colour}" '
+            f'stroke-width="{0.8 * unit:.2f}"{dashed}>'
+            f"<title>{escape(f'{WORDS[mark.kind]} {mark.label}'.strip())}</title></{name}>"
         )
-        if one.said and lettered:
-            x, y = points[0] + unit * np.array(_BESIDE_IT.get(one.kind, (2.4, -1.2)))
-            size = (6.0 if one.kind == BESIDE else 4.0) * unit
+        if mark.label and lettered:
+            # the size of the letters and the offset of the label, in units
+            size, offset = (6.0, (16.0, 2.0)) if mark.kind == BESIDE else (4.0, (2.4, -1.2))
+            x, y = points[0] + unit * np.array(offset)
             parts.append(
-                f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:.2f}" fill="{colour}" '
+                f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size * unit:.2f}" fill="{colour}" '
                 f'font-family="sans-serif" stroke="#000" stroke-width="{0.9 * unit:.2f}" '
-                f'paint-order="stroke">{escape(one.said)}</text>'
+                f'paint-order="stroke">{escape(mark.label)}</text>'
             )
     return "".join(parts)
 
 
-def _shape(kind: str, points: Array, reach: float) -> tuple[str, str]:
-    """The SVG element of a mark and its attributes."""
+def _shape(kind: str, points: Array, r: float) -> tuple[str, str]:
+    """The SVG element of a mark and its attributes; `r` is half the size of a point's mark."""
     if len(points) > 1:
         return "polygon", f'points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points)}"'
-    (x, y), r = points[0], reach
+    x, y = points[0]
     if kind == BESIDE:
         return "circle", f'cx="{x:.1f}" cy="{y:.1f}" r="{7 * r:.1f}"'
     if kind == FIXTURE:
         return "path", f'd="M{x - r:.1f} {y:.1f}H{x + r:.1f}M{x:.1f} {y - r:.1f}V{y + r:.1f}"'
-    way = (
-        f"M{x - r:.1f} {y - r:.1f}l{2 * r:.1f} {2 * r:.1f}m0 {-2 * r:.1f}l{-2 * r:.1f} {2 * r:.1f}"
-    )
-    return "path", f'd="{way}"'
+    d = 2 * r
+    cross = f"M{x - r:.1f} {y - r:.1f}l{d:.1f} {d:.1f}m0 {-d:.1f}l{-d:.1f} {d:.1f}"
+    return "path", f'd="{cross}"'
 
 
-_MOST_PX = 320  # per side: twice the widest display
-_VIRIDIS = np.array(
-    [
-        [68, 1, 84],
-        [71, 44, 122],
-        [59, 81, 139],
-        [44, 113, 142],
-        [33, 144, 141],
-        [39, 173, 129],
-        [92, 200, 99],
-        [170, 220, 50],
-        [253, 231, 37],
-    ],
-    float,
-)
-
-
-def picture(
+def image_svg(
     rgb: NDArray[np.uint8],
     uv: Array,
-    bones: Sequence[tuple[int, int]],
+    bones: Sequence[Sequence[int]],
     left: int,
     top: int,
     marks: Sequence[Mark] = (),
@@ -183,7 +160,7 @@ def picture(
     """A crop of a depth image, with the scene and the skeleton over it.
 
     Args:
-        rgb: (h, w, 3) uint8 RGB, the depth in colours, see `Relief.picture`.
+        rgb: (h, w, 3) uint8 RGB, the depth in colours, see `Relief.image`.
         uv: (J, 2) joints, px of the whole frame, counted from the centre of its first pixel.
         bones: pairs of joints.
         left: the crop's first column, px of the frame.
@@ -194,13 +171,15 @@ def picture(
         lettered: whether to write the labels of marks.
     """
     h, w = rgb.shape[:2]
-    points = (
-        uv - [left, top] + 0.5
-    )  # SVG counts from the image's corner, we count from a pixel's centre
+    # SVG counts from the image's corner, we count from a pixel's centre
+    points = uv - [left, top] + 0.5
     bone_px = np.median([np.hypot(*(points[a] - points[b])) for a, b in bones] or [w])
     usual = w / 70.0
     r = float(np.clip(0.4 * bone_px, w / 200.0, usual)) if unit is None else unit
-    parts = [f'<image href="{png_uri(_small(rgb))}" width="{w}" height="{h}"/>']
+    share = min(_MOST_PX / max(h, w), 1.0)
+    size = (round(share * w), round(share * h))
+    small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    parts = [f'<image href="{png_uri(small)}" width="{w}" height="{h}"/>']
     parts.append(svg_marks(marks, left, top, w, h, 0.9 * (unit or usual), lettered))
     for colour, width in (("#222", 1.3 * r), ("#fff", 0.8 * r)):  # for light and dark surfaces
         for a, b in bones:
@@ -226,32 +205,79 @@ def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
         reach_mm: height above the floor of the lightest colour, mm.
     """
     read = depth > 0
-    if not read.any():
-        return np.full((*depth.shape, 3), 90, np.uint8)
-    far = float(np.percentile(depth[read], 95.0)) + 3.0
-    share = np.clip((far - depth) / reach_mm, 0.0, 1.0)
-    at = share * (len(_VIRIDIS) - 1)
-    low = np.minimum(at.astype(int), len(_VIRIDIS) - 2)
-    rgb = _VIRIDIS[low] + (at - low)[..., None] * (_VIRIDIS[low + 1] - _VIRIDIS[low])
-    rgb[~read] = 90.0
-    return rgb.astype(np.uint8)
+    far = (float(np.percentile(depth[read], 95.0)) if read.any() else 0.0) + 3.0
+    rgb = colormaps["viridis"](np.clip((far - depth) / reach_mm, 0.0, 1.0), bytes=True)[..., :3]
+    return np.asarray(np.where(read[..., None], rgb, _UNREAD), np.uint8)
 
 
-def _small(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """An image (h, w, 3) reduced by averaging to at most `_MOST_PX` per side."""
-    import cv2
+def png(rgb: NDArray[np.uint8], fast: bool = False) -> bytes:
+    """An image (h, w, 3) uint8 RGB as PNG; `fast` compresses less.
 
-    height, width, _ = rgb.shape
-    share = _MOST_PX / max(height, width)
-    if share >= 1.0:
-        return rgb
-    size = (round(share * width), round(share * height))
-    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    Raises:
+        SessionError: it cannot be encoded.
+    """
+    how = [cv2.IMWRITE_PNG_COMPRESSION, 1] if fast else []
+    done, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]), how)
+    if not done:
+        raise SessionError("the image cannot be encoded as PNG")
+    return bytes(encoded)
 
 
 def png_uri(rgb: NDArray[np.uint8]) -> str:
     """An image (h, w, 3) uint8 RGB as the data URI of a PNG."""
-    import cv2
+    return "data:image/png;base64," + base64.b64encode(png(rgb)).decode()
 
-    _, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
-    return "data:image/png;base64," + base64.b64encode(encoded.tobytes()).decode()
+
+def thumbnails(session: Session) -> list[tuple[str, str, str, str]]:
+    """The contact sheet: the session's thumbnails with scene and skeleton, in order of time.
+
+    Returns:
+        (SVG, time, the ethogram's action at that time or an empty text, its colour) of each.
+    """
+    marks = scene_marks(session)
+    colours = action_colours(list(session.metadata.get("actions", {})))
+    bouts = session.bouts
+    made = []
+    for svg, time_s in _drawn(session, session.metadata.get("thumbnails", []), marks):
+        here = (bouts["start_s"] <= time_s + 1e-6) & (bouts["stop_s"] > time_s + 1e-6)
+        word = next(iter(bouts.loc[here, "action"].astype(str)), "")
+        made.append((svg, f"{time_s:.2f} s", word, colours.get(word, "")))
+    return made
+
+
+def whole_image(session: Session) -> tuple[str, str] | None:
+    """The whole depth image with another animal in view that is not tracked.
+
+    Returns:
+        SVG, and its time; None if the session has none.
+    """
+    entry = session.metadata.get("whole_picture")
+    if not entry:
+        return None
+    beside = Mark(BESIDE, np.array([entry["beside_px"]], float), "not measured")
+    marks = [*scene_marks(session), beside]
+    unit = session.camera.width / 250.0
+    drawn = _drawn(session, [entry], marks, unit=unit, lettered=True)
+    return next(((svg, f"{time_s:.2f} s") for svg, time_s in drawn), None)
+
+
+def _drawn(
+    session: Session, entries: Sequence[dict[str, Any]], marks: Sequence[Mark], **style: Any
+) -> list[tuple[str, float]]:
+    """Kept depth images as SVG with their times, s; images that cannot be read are left out."""
+    if not entries:
+        return []
+    index = [entry["frame_index"] for entry in entries]
+    poses = session.table("poses", ["frame_index", "u_px", "v_px"], index)
+    time_s = session.frames.set_index("frame_index")["time_s"]
+    bones = session.metadata["animal"]["bones"]
+    relief = Relief(session, scale_mm([session]))  # as in the session's video
+    made = []
+    for k, entry in zip(index, entries, strict=True):
+        cut, whole = read_cutout(session, entry)
+        if cut is not None:
+            left, top = int(entry["left_px"]), int(entry["top_px"])
+            rgb = relief.image(whole, left, top, cut.shape[::-1], cut.shape[::-1])
+            uv = poses.loc[poses["frame_index"] == k, ["u_px", "v_px"]].to_numpy(float)
+            made.append((image_svg(rgb, uv, bones, left, top, marks, **style), float(time_s[k])))
+    return made

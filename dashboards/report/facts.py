@@ -1,4 +1,8 @@
-"""Provenance of a report: recording, camera, sensor, animal, software, and cost."""
+"""Facts of a report: methods, provenance, warnings, and the account of all frames.
+
+Thresholds of the warnings: 2 % of the frames lost, 5 % doubtful, a predicted joint error of 10 % of
+the length, a speed noise as large as the pause threshold.
+"""
 
 from __future__ import annotations
 
@@ -7,32 +11,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.behaviour.body import axis_of
-from liex_lab.optics.camera import SensorCard
 from liex_lab.sessions import Session
+from liex_lab.sessions.correcting import disagreements
 
-from ..units import counted
+from ..units import counted, paragraphs, shown
 
-_TEMPLATE = Path(__file__).parent / "templates" / "methods.j2"
+_TEMPLATES = Path(__file__).parent / "templates"
+_LOST_SHARE = 0.02
+_DOUBTFUL_SHARE = 0.05
+_ERROR_SHARE = 0.1
+_NOISE_SHARE = 1.0
 
 
 def methods(session: Session) -> list[str]:
     """Paragraphs for a methods section, from the run's record; the text is in methods.j2."""
-    from jinja2 import StrictUndefined, Template
-
     about = session.metadata
     axis = axis_of(about["animal"])
     actions = about.get("actions") or {}
     named = {word.replace("_", " "): meaning for word, meaning in actions.items()}
-    template = Template(
-        _TEMPLATE.read_text("utf-8"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    text = template.render(
+    sources = {str(source) for source in session.bouts["source"]}
+    if about.get("action_model"):
+        sources.add("model")
+    elif actions and not sources & {"model", "rule"}:
+        sources.add("rule")
+    return paragraphs(
+        _TEMPLATES / "methods.j2",
         about=about,
         counted=counted,
         kind=axis.kind,
@@ -42,7 +49,7 @@ def methods(session: Session) -> list[str]:
         optics=optics(session),
         corrections=about.get("corrections"),
         rules=about.get("rules"),
-        sources=naming(session),
+        sources=sources,
         recogniser=_recogniser(session),
         n_refused=len((about.get("refused_bouts") or {}).get("bouts", [])),
         n_human=int((session.bouts["source"] == "human").sum()),
@@ -52,8 +59,55 @@ def methods(session: Session) -> list[str]:
         checked=any("(checked: " in meaning for meaning in actions.values()),
         across_gaps=ACROSS_GAPS,
     )
-    paragraphs = (" ".join(part.split()) for part in text.split("<paragraph>"))
-    return [paragraph for paragraph in paragraphs if paragraph]
+
+
+def warnings(session: Session) -> list[str]:
+    """Warnings as sentences, those of the recording first; the text is in warnings.j2."""
+    about = session.metadata
+    frames = about["frames"]
+    hidden = int(frames["flags"].get("hidden", 0))
+    # only two columns: the dashboard reads them for every session of a study
+    error, spine = session.table("frames", ["predicted_error_mm", "spine_mm"]).median()
+    behaviour = session.has("summary.csv")
+    fps = frames["fps_median"] or 0.0
+    slow: list[str] = []
+    if behaviour:
+        columns = session.columns
+        slow = list(
+            dict.fromkeys(
+                columns["name"][
+                    (columns["unreliable_below_fps"] > fps)
+                    & columns["table"].isin(["kinematics", "bouts"])
+                ]
+            )
+        )
+    summary = session.summary.iloc[0] if behaviour else {}
+    return about["problems"] + paragraphs(
+        _TEMPLATES / "warnings.j2",
+        counted=counted,
+        shown=shown,
+        frames=frames,
+        n_animals=int((about.get("verdict") or {}).get("n_animals", 1)),
+        hidden=hidden,
+        lost=frames["n_frames"] - frames["n_observed"] - hidden,
+        doubtful=int(frames["flags"].get("doubtful", 0)),
+        error=error,
+        spine=spine,
+        flips=session.flips,
+        disagreements=disagreements(session),
+        behaviour=behaviour,
+        noise=summary.get("speed_noise_mm_s", np.nan),
+        pause=(about.get("rules") or {}).get("pause_below_mm_s", np.nan),
+        schema=about["schema_version"],
+        n_gaps=len(session.gaps),
+        slow=slow,
+        fps=fps,
+        n_contradicting=len(_contradicting(session)),
+        lost_share=_LOST_SHARE,
+        doubtful_share=_DOUBTFUL_SHARE,
+        error_share=_ERROR_SHARE,
+        noise_share=_NOISE_SHARE,
+    )
 
 
 def _recogniser(session: Session) -> dict[str, Any]:
@@ -93,21 +147,10 @@ def optics(session: Session) -> str:
             f"{water['refractive_index']:g}, {water['ranging'].replace('_', ' ')} camera)"
         )
     if found.get("mirrored"):
-        undone.append("the mirroring of the pictures")
-    what = " and ".join(undone)
-    return (
-        f"{what} undone; camera and pictures are those of an ideal camera in air" if undone else ""
-    )
-
-
-def naming(session: Session) -> set[str]:
-    """The sources of the actions: model, rule or human, from the table `bouts` and the metadata."""
-    found = {str(source) for source in session.bouts["source"]}
-    if session.metadata.get("action_model"):
-        found.add("model")
-    elif session.metadata.get("actions") and not found & {"model", "rule"}:
-        found.add("rule")
-    return found
+        undone.append("the mirroring of the images")
+    if not undone:
+        return ""
+    return f"{' and '.join(undone)} undone; camera and images are those of an ideal camera in air"
 
 
 def beside_average(shape: Mapping[str, Any]) -> str:
@@ -116,97 +159,51 @@ def beside_average(shape: Mapping[str, Any]) -> str:
     Args:
         shape: section `animal.shape` of session.json.
     """
-    if not shape.get("kept"):
-        return f"the average animal's: {shape.get('why', 'none was fitted')}"
-    places = ", ".join(f"{100 * place:.0f}" for place in shape["places"])
-    wide, high = (
-        ", ".join(
-            f"{factor:.2f} ± {factor * sd:.2f}"
-            for factor, sd in zip(shape[name], shape[f"{name}_sd"], strict=True)
-        )
-        for name in ("width", "height")
-    )
-    most = max(float(np.linalg.norm(moved)) for moved in shape["joints_moved"])
-    by = shape.get("shared_by")
-    whose = f"shared by {by}" if by else f"its own, fitted to {shape['n_frames']} frames"
-    told = (
-        f"{whose}; at {places} % of its length it is {wide} times as wide and {high} times as high "
-        f"as the average animal. Joints were moved by up to {100 * most:.1f} % of its length for it"
-    )
-    own, average = shape.get("residual_mm"), shape.get("average_residual_mm")
-    if own is None or average is None:
-        return told
-    held = f"{shape['n_frames']} frames" if by else "frames that were held out"
-    return (
-        f"{told}. On {held} this body lies {own:.2f} mm from the depth, the average one "
-        f"{average:.2f} mm"
-    )
+    moved = [float(np.linalg.norm(joint)) for joint in shape.get("joints_moved", ())]
+    return " ".join(paragraphs(_TEMPLATES / "shape.j2", shape=shape, moved=moved))
 
 
-def facts(session: Session) -> list[tuple[str, str]]:
-    """Recording, camera, animal, software and cost, as (name, value)."""
-    about = session.metadata
-    camera = about["camera"]
-    frames = about["frames"]
-    animal = about["animal"]
-    flags = ", ".join(
-        f"{count} {flag.replace('_', ' ')}" for flag, count in frames["flags"].items()
-    )
-    spine = spine_mm(session)
-    size = f"spine {spine:.1f} mm" if np.isfinite(spine) else "spine unknown"
-    if animal.get("spine_mm"):
-        size += (
-            f"; size that the method began with {animal['spine_mm']:.1f} mm "
-            f"({animal.get('origin', 'origin unknown')})"
-        )
-    memory = about.get("peak_memory_mb")
-    zones = ", ".join(zone.name for zone in session.zones)
-    known = [
-        ("Recording", f"{about['input']['name']} ({about['input']['format']})"),
-        ("Input, sha256", about["input"]["sha256"]),
-        (
-            "Animal",
-            f"{about['individual']}, {animal['name']}, {size}",
-        ),
-        *([("Shape", beside_average(animal["shape"]))] if animal.get("shape") else []),
-        (
-            "Frames",
-            f"{frames['n_frames']:,} recorded ({flags}); {frames['n_missing']} not delivered, in "
-            f"{counted(frames['n_gaps'], 'gap')}",
-        ),
-        (
-            "Camera",
-            f"{camera['width']} x {camera['height']} px, fx {camera['fx']:.1f}, fy "
-            f"{camera['fy']:.1f}, cx {camera['cx']:.1f}, cy {camera['cy']:.1f} px "
-            f"({camera['source']}), {camera['floor_distance_mm']:.0f} mm from the floor",
-        ),
-        *sensor_row(about),
-        ("Arena", f"{session.arena}{f'; zones: {zones}' if zones else ''}"),
-        (
-            "Model",
-            f"{about['model'].get('name', 'none')} {about['model'].get('sha256', '')[:16]}".strip(),
-        ),
-        (
-            "Software",
-            ", ".join(f"{name} {v}" for name, v in about["versions"].items() if v != "unknown"),
-        ),
-        (
-            "Run",
-            f"{about['timings_s']['total']:.1f} s, {about['frames_per_s']:.0f} frames/s"
-            + (f", peak memory {memory:.0f} MB" if memory else ""),
-        ),
-    ]
-    if undone := optics(session):
-        known.insert(5, ("Optics", undone))
-    subject = ", ".join(f"{name} {value}" for name, value in about["subject"].items())
-    return known + ([("Subject", subject)] if subject else [])
+def _contradicting(session: Session) -> pd.DataFrame:
+    """Bouts that a person named or a correction changed, and that contradict their definition."""
+    bouts = session.bouts
+    if "contradicts" not in bouts:
+        return bouts.iloc[:0]
+    return bouts[bouts["contradicts"].fillna("") != ""]
 
 
-def sensor_row(about: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The line on the sensor's quality; empty if unknown.
+def refusal_rows(session: Session) -> list[tuple[str, str, str, str, str]]:
+    """Bouts that contradict their definition: the renamed ones first, then the unchanged ones.
 
-    Args:
-        about: session.json.
+    Returns:
+        (from, to, name, what was done, contradiction), times in s.
     """
-    known = about.get("scene", {}).get("sensor")
-    return [] if known is None else [("Sensor", str(SensorCard.from_dict(known)))]
+    refused = (session.metadata.get("refused_bouts") or {}).get("bouts", [])
+    rows = [(one, one["named"] or "unlabelled", one["why"]) for one in refused]
+    kept = _contradicting(session).to_dict("records")
+    rows += [(one, f"left, by {one['source']}", one["contradicts"]) for one in kept]
+    return [
+        (f"{one['start_s']:.2f}", f"{one['stop_s']:.2f}", str(one["action"]), str(what), str(why))
+        for one, what, why in rows
+    ]
+
+
+def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
+    """The classification of all frames that the camera should have taken.
+
+    Returns:
+        (class, share, number, CSS class for its colour) of trusted, doubtful, hidden, lost and
+            undelivered frames; hidden ones only if present.
+    """
+    frames = session.metadata["frames"]
+    doubtful = int(frames["flags"].get("doubtful", 0))
+    hidden = int(frames["flags"].get("hidden", 0))
+    lost = frames["n_frames"] - frames["n_observed"] - hidden
+    parts = [
+        ("trusted pose", frames["n_observed"] - doubtful, "good"),
+        ("doubtful pose", doubtful, "doubt"),
+        *([("hidden", hidden, "gone")] if hidden else []),
+        ("no pose", lost, "lost"),
+        ("not delivered", frames["n_missing"], "gone"),
+    ]
+    total = max(sum(count for _, count, _ in parts), 1)
+    return [(what, count / total, int(count), kind) for what, count, kind in parts]

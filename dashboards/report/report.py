@@ -13,34 +13,44 @@ import numpy as np
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED_COLOUR, action_colours
+from liex_lab.optics.camera import SensorCard
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import found_video
 from liex_lab.sessions.verdict import verdict_in
 
-from ..figures.seen import FRAMES, KINEMATICS
+from ..figures.animals import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
 from ..units import counted, day, page, reading, shown, titled
 from ..video.relief import scale_mm
-from .charts import pictures, whole_picture
-from .facts import facts, methods
-from .quality import flip_rows, frame_account, refusal_rows, warnings
+from .contact_sheet import thumbnails, whole_image
+from .facts import (
+    beside_average,
+    frame_account,
+    methods,
+    optics,
+    refusal_rows,
+    spine_mm,
+    warnings,
+)
 
 TEMPLATES = Path(__file__).parent / "templates"
-_TABLES = {
-    "frames": "frames.parquet",
-    "poses": "poses.parquet",
-    "rotations": "rotations.parquet",
-    "kinematics": "kinematics.parquet",
-    "bouts": "bouts.parquet",
-    "gaps": "gaps.parquet",
-    "flips": "flips.parquet",
-    "sessions": "sessions.parquet",
-    "summary": "summary.csv",
-    "transitions": "transitions.parquet",
-    "activity": "activity.parquet",
-    "zones": "zones.parquet",
-}
+
+
+_TABLES = (
+    *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
+    *("summary", "transitions", "activity", "zones"),
+)
+
+
+def write_views(folder: str | Path) -> Path:
+    """Write the report and the layout files of both replays; returns the report's path."""
+    from ..replay.layouts import write_blueprint, write_layout
+
+    session = Session.open(folder)
+    write_blueprint(session)
+    write_layout(session)
+    return write_report(folder)
 
 
 def write_report(folder: str | Path) -> Path:
@@ -58,59 +68,51 @@ def render(session: Session, figures: Path | None = None) -> str:
         session: the opened session.
         figures: the folder for figure files; None writes none.
     """
-    words = list(session.metadata.get("actions", {}))
+    about = session.metadata
+    words = list(about.get("actions", {}))
+    gaps, flips, video = session.gaps, session.flips, found_video(session)
+    sensor = about.get("scene", {}).get("sensor")
+    likely = flips.nlargest(12, "p_flip").sort_values("start_s") if len(flips) else flips
     return page(
         TEMPLATES / "report.html.j2",
+        about=about,
+        counted=counted,
+        reading=reading,
         name=session.name,
-        animal=session.metadata["animal"]["name"],
+        animal=about["animal"]["name"],
         headline=headline(session),
         cards=cards(session),
-        subject=", ".join(
-            f"{name.replace('_', ' ')} {value}"
-            for name, value in session.metadata["subject"].items()
-        ),
-        verdict=verdict_in(session.metadata),
+        subject=", ".join(f"{k.replace('_', ' ')} {v}" for k, v in about["subject"].items()),
+        verdict=verdict_in(about),
         warnings=warnings(session),
         account=frame_account(session),
-        flips=flip_rows(session),
-        pictures=pictures(session),
-        whole_picture=whole_picture(session),
-        n_animals=(session.metadata.get("verdict") or {}).get("n_animals", 1),
+        flips=likely.to_dict("records"),
+        thumbnails=thumbnails(session),
+        whole_image=whole_image(session),
+        n_animals=(about.get("verdict") or {}).get("n_animals", 1),
         no_pose=NO_POSE,
         top_mm=scale_mm([session]),
-        last_joint=session.metadata["animal"]["joints"][-1].replace("_", " "),
+        last_joint=about["animal"]["joints"][-1].replace("_", " "),
         figures=for_the_page(session, figures),
         clips=clip_links(session),
-        video=None if (video := found_video(session)) is None else video.name,
-        actions=action_rows(session, words),
+        video=None if video is None else video.name,
+        unresolved=about.get("unresolved_actions") or {},
         summary=summary_rows(session, words),
         budget=budget_rows(session, words),
         across_gaps=ACROSS_GAPS,
-        zones=zone_rows(session),
-        facts=facts(session),
-        gaps=gap_rows(session),
+        arena=session.arena,
+        zones=session.zones,
+        zone_rows=session.table("zones").to_dict("records") if session.has("zones.parquet") else [],
+        spine=spine_mm(session),
+        optics=optics(session),
+        sensor="" if sensor is None else str(SensorCard.from_dict(sensor)),
+        beside_average=beside_average,
+        gaps=gaps.nlargest(12, "n_frames_missing").sort_values("start_s").to_dict("records"),
         refused=refusal_rows(session),
-        no_actions=session.metadata.get("no_actions", ""),
+        no_actions=about.get("no_actions", ""),
         methods=methods(session),
         glossary=glossary(session),
     )
-
-
-def action_rows(session: Session, words: list[str]) -> list[tuple[str, str, str, str]]:
-    """The vocabulary: (word, colour, meaning, what the frame rate cannot resolve).
-
-    `words` are the actions, in the order of their colours.
-    """
-    unresolved = session.metadata.get("unresolved_actions") or {}
-    return [
-        (
-            word,
-            colour,
-            session.metadata["actions"][word],
-            str(unresolved.get(word, "")),
-        )
-        for word, colour in action_colours(words).items()
-    ]
 
 
 def clip_links(session: Session) -> dict[str, str]:
@@ -119,13 +121,12 @@ def clip_links(session: Session) -> dict[str, str]:
     A video of `rear` also covers rear_supported.
     """
     links = {}
-    for word in dict.fromkeys(str(action) for action in session.bouts["action"]):
+    for word in session.bouts["action"].astype(str).unique():
         parts = word.split("_")
-        for k in range(len(parts), 0, -1):
-            video = found_video(session, "_".join(parts[:k]))
-            if video is not None:
-                links[word] = video.name
-                break
+        names = ("_".join(parts[:k]) for k in range(len(parts), 0, -1))
+        found = (found_video(session, name) for name in names)
+        if video := next(filter(None, found), None):
+            links[word] = video.name
     return links
 
 
@@ -144,9 +145,7 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
     """The key numbers: (value, unit, name)."""
     frames = session.metadata["frames"]
     n = frames["n_frames"]
-    good = [
-        (f"{frames['n_observed'] / n:.1%}", "", f"of {counted(n, 'frame')} with a pose"),
-    ]
+    good = [(f"{frames['n_observed'] / n:.1%}", "", f"of {counted(n, 'frame')} with a pose")]
     error = session.frames["predicted_error_mm"].median()
     if np.isfinite(error):
         good.append((f"{error:.1f}", "mm", "predicted joint error, median"))
@@ -159,9 +158,8 @@ def cards(session: Session) -> list[tuple[str, str, str]]:
         (reading(speed, unit), unit, "mean speed"),
     ]
     if "rear_count" in row and "tail_beat_hz" not in row:
-        rears = int(row["rear_count"])
-        what = "rear" if rears == 1 else "rears"
-        first.append((f"{rears}", "", f"{what}, {row['rear_s']:.1f} s in all"))
+        rears, what = counted(int(row["rear_count"]), "rear").split()
+        first.append((rears, "", f"{what}, {row['rear_s']:.1f} s in all"))
     elif np.isfinite(row.get("tail_beat_hz", np.nan)):
         first.append((f"{row['tail_beat_hz']:.1f}", "Hz", "tail beat, median"))
     return [*first, *good]
@@ -230,49 +228,15 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
     return rows
 
 
-def zone_rows(session: Session) -> list[tuple[str, list[str]]]:
-    """A row per zone: name; time, share, visits, latency, mean visit, distance."""
-    if not session.has("zones.parquet"):
-        return []
-    table = session.table("zones")
-    numbers = table[["time_s", "n_visits", "latency_s", "mean_visit_s", "distance_mm"]].to_numpy(
-        float
-    )
-    return [
-        (
-            str(name),
-            [
-                reading(row[0], "s"),
-                f"{share:.1%}",
-                f"{row[1]:.0f}",
-                *(reading(value, "s") for value in row[2:4]),
-                reading(row[4], "mm"),
-            ],
-        )
-        for name, share, row in zip(table["zone"], table["share"], numbers, strict=True)
-    ]
-
-
-def gap_rows(session: Session) -> list[tuple[str, str, str, str]]:
-    """The longest gaps, at most twelve, by time: (from, to, frames, reason); times in s."""
-    shown = session.gaps.nlargest(12, "n_frames_missing").sort_values("start_s")
-    return [
-        (
-            f"{row.start_s:.2f}",
-            f"{row.stop_s:.2f}",
-            str(row.n_frames_missing),
-            str(row.reason).replace("_", " "),
-        )
-        for row in shown.itertuples()
-    ]
-
-
 def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
     """The columns of every table of the session: (file, columns)."""
     columns = session.columns.astype(object).where(session.columns.notna(), "")
+    files = {
+        table: "summary.csv" if table == "summary" else f"{table}.parquet" for table in _TABLES
+    }
     return [
         (file, columns[columns["table"] == table].to_dict("records"))
-        for table, file in _TABLES.items()
+        for table, file in files.items()
         if session.has(file)
     ]
 

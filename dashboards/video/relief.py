@@ -10,12 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
+from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from liex_lab.sessions import Session
 
-Array = NDArray[np.float64]
+from ..figures.animals import Array, paste
+
 _UNREAD = 34  # grey of unread pixels
 _WALLS_FROM = 1.6  # of the scale: higher pixels are not the animal
 _SMOOTH_PX = 1.0
@@ -34,8 +37,6 @@ class Relief:
     """
 
     def __init__(self, session: Session, top_mm: float) -> None:
-        from matplotlib import colormaps
-
         camera = session.camera
         up = np.asarray(session.T_arena_camera.rotation, float)[2]
         u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
@@ -55,7 +56,7 @@ class Relief:
         heights[depth == 0] = np.nan
         return heights
 
-    def picture(
+    def image(
         self,
         depth: NDArray[np.uint16],
         left: int,
@@ -75,8 +76,6 @@ class Relief:
         Returns:
             (height, width, 3) uint8 RGB.
         """
-        import cv2
-
         heights = _part(self.heights(depth), left, top, side)
         read = np.isfinite(heights)
         # unread pixels are floor while they are enlarged, and painted over afterwards
@@ -85,23 +84,17 @@ class Relief:
         smooth = cv2.resize(even, size, interpolation=cv2.INTER_CUBIC)
         share = np.clip(255.0 / self.top_mm * smooth, 0.0, 255.0).astype(np.uint8)
         colours = cv2.LUT(cv2.merge([share] * 3), self._colours[None])
-        light = cv2.resize(
-            self._light(np.asarray(even, np.float32)), size, interpolation=cv2.INTER_LINEAR
-        )
+        slope_y, slope_x = np.gradient(np.asarray(even, np.float32), self.pixel_mm)
+        slope = 1.0 + _STRENGTH * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
+        light = (_PLAIN * np.clip(slope, 0.6, 1.4)).astype(np.uint8)
+        light = cv2.resize(light, size, interpolation=cv2.INTER_LINEAR)
         colours = cv2.multiply(colours, cv2.merge([light] * 3), scale=1.0 / _PLAIN)
         outside = _part(self._outside, left, top, side) > 0.5
         # walls are dimmed; an animal that rears at a wall remains visible in front of it
-        wall = outside | (clipped > _WALLS_FROM * self.top_mm)
-        dim = _enlarged(wall, size)
+        dim = _enlarged(outside | (clipped > _WALLS_FROM * self.top_mm), size)
         colours[dim] = colours[dim] // 4
         colours[_enlarged(~read, size)] = _UNREAD
         return np.asarray(colours, np.uint8)
-
-    def _light(self, heights: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Brightness of a slope, `_PLAIN` if level: uint8 of the heights' shape."""
-        slope_y, slope_x = np.gradient(heights, self.pixel_mm)
-        light = 1.0 + _STRENGTH * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
-        return (_PLAIN * np.clip(light, 0.6, 1.4)).astype(np.uint8)
 
     def scale(self, height: int) -> NDArray[np.uint8]:
         """The colours from 0 to `top_mm`, the highest on top: (height, 6, 3) uint8 RGB."""
@@ -122,39 +115,12 @@ def scale_mm(sessions: Sequence[Session]) -> float:
     return max(10.0 * float(np.ceil(max(known) / 10.0)), 20.0) if known else 80.0
 
 
-def put_back(
-    cut: NDArray[np.uint16], left: int, top: int, shape: tuple[int, int]
-) -> NDArray[np.uint16]:
-    """A depth image (H, W) that contains only a cut-out, 0 elsewhere.
-
-    Args:
-        cut: (h, w) uint16 mm; its part outside the image is left out.
-        left: its first column in the image, px; may be negative.
-        top: its first row, px.
-        shape: (H, W) of the image.
-    """
-    depth = np.zeros(shape, np.uint16)
-    x0 = max(left, 0)
-    y0 = max(top, 0)
-    x1 = min(left + cut.shape[1], depth.shape[1])
-    y1 = min(top + cut.shape[0], depth.shape[0])
-    if x1 > x0 and y1 > y0:
-        depth[y0:y1, x0:x1] = cut[y0 - top : y1 - top, x0 - left : x1 - left]
-    return depth
-
-
 def _part(
     heights: NDArray[np.float32], left: int, top: int, side: tuple[int, int]
 ) -> NDArray[np.float32]:
     """A part of a map, NaN outside the map."""
-    width, height = side
-    out = np.full((height, width), np.nan, np.float32)
-    x0 = max(left, 0)
-    y0 = max(top, 0)
-    x1 = min(left + width, heights.shape[1])
-    y1 = min(top + height, heights.shape[0])
-    if x1 > x0 and y1 > y0:
-        out[y0 - top : y1 - top, x0 - left : x1 - left] = heights[y0:y1, x0:x1]
+    out = np.full(side[::-1], np.nan, np.float32)
+    paste(out, heights, -left, -top)
     return out
 
 
@@ -171,7 +137,5 @@ def _beyond_walls(session: Session, rays: Array) -> NDArray[np.float32]:
 
 def _enlarged(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
     """A mask in another size, with smooth edges."""
-    import cv2
-
     large = cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
     return np.asarray(large > 127)

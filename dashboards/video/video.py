@@ -6,14 +6,14 @@ and dimmed until the longest ends. Of too many bouts, an evenly spaced selection
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,8 +39,6 @@ def h264() -> str:
     Raises:
         SessionError: there is none.
     """
-    import av
-
     for name in _CODECS:
         try:
             av.codec.Codec(name, "w")
@@ -54,10 +52,13 @@ def h264() -> str:
     )
 
 
-class Video:
-    """A video file that is written frame by frame (a context manager).
+@contextmanager
+def video_file(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8], float], None]]:
+    """A video file that is written frame by frame; after an error no file remains.
 
-    It is written under another name and renamed at the end; after an error no file remains.
+    Yields:
+        A function that appends an image (H, W, 3) uint8 RGB, all of the size of the first, at a
+            time, s, later than the previous one; 0 at the first. An odd row or column is left out.
 
     Args:
         path: the file to write.
@@ -67,70 +68,32 @@ class Video:
         SessionError: there is no encoder.
         PlaceError: the path is a symbolic link.
     """
+    codec = h264()
+    # the index at the beginning, for streaming players; no writer's name
+    options = {"movflags": "+faststart", "fflags": "+bitexact"}
+    with (
+        replacing(unlinked(path)) as part,
+        av.open(str(part), "w", format="mp4", options=options) as container,
+    ):
+        stream: Any = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
+        stream.pix_fmt = "yuv420p"
+        stream.codec_context.time_base = _CLOCK
+        stream.codec_context.thread_count = _THREADS
+        if codec == "libx264":
+            stream.options = {"crf": "20", "preset": "veryfast"}
 
-    def __init__(self, path: Path, fps: float) -> None:
-        self._codec = h264()
-        self._path = unlinked(path)
-        self._files = ExitStack()
-        self._fps = Fraction(fps).limit_denominator(1001)
-        self._box: Any = None
-        self._stream: Any = None
+        def add(image: NDArray[np.uint8], time_s: float) -> None:
+            height, width = (n - n % 2 for n in image.shape[:2])
+            if not stream.codec_context.is_open:  # at the first image
+                stream.height, stream.width = height, width
+            even = np.ascontiguousarray(image[:height, :width])
+            frame = av.VideoFrame.from_ndarray(even, format="rgb24")
+            frame.time_base = _CLOCK
+            frame.pts = round(time_s / _CLOCK)
+            container.mux(stream.encode(frame))
 
-    def __enter__(self) -> Video:
-        return self
-
-    def add(self, picture: NDArray[np.uint8], time_s: float) -> None:
-        """Append an image; all have the size of the first.
-
-        Args:
-            picture: (H, W, 3) uint8 RGB; an odd row or column is left out.
-            time_s: its time, s, later than the previous one; 0 at the first.
-        """
-        import av
-
-        height, width = (n - n % 2 for n in picture.shape[:2])
-        if self._box is None:
-            part = self._files.enter_context(replacing(self._path))
-            self._box = av.open(str(part), "w", format="mp4", options=_box_options())
-            self._files.push(self._end)
-            self._stream = self._box.add_stream(self._codec, rate=self._fps)
-            self._stream.width = width
-            self._stream.height = height
-            self._stream.pix_fmt = "yuv420p"
-            self._stream.codec_context.time_base = _CLOCK
-            self._stream.codec_context.thread_count = _THREADS
-            if self._codec == "libx264":
-                self._stream.options = {"crf": "20", "preset": "veryfast"}
-        frame = av.VideoFrame.from_ndarray(
-            np.ascontiguousarray(picture[:height, :width]), format="rgb24"
-        )
-        frame.time_base = _CLOCK
-        frame.pts = round(time_s / _CLOCK)
-        self._box.mux(self._stream.encode(frame))
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._files.__exit__(kind, error, trace)
-
-    def _end(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the container, after the last frames if there was no error."""
-        if kind is None:
-            self._box.mux(self._stream.encode())
-        self._box.close()
-
-
-def _box_options() -> dict[str, str]:
-    """The index at the beginning, for streaming players; no writer's name."""
-    return {"movflags": "+faststart", "fflags": "+bitexact"}
+        yield add
+        container.mux(stream.encode())
 
 
 _BEFORE_S = 0.5  # before a bout
@@ -163,26 +126,24 @@ class Cell:
     title: str
     animal: int | None = None
 
-    def picture(self, after_s: float, size: tuple[int, int]) -> NDArray[np.uint8]:
+    def image(self, after_s: float, size: tuple[int, int]) -> NDArray[np.uint8]:
         """The image at a time after the beginning; dimmed after the end.
 
         Args:
             after_s: time from its beginning, s.
             size: width and height, px.
         """
-        over = self.start_s + after_s > self.stop_s
-        time_s = min(self.start_s + after_s, self.stop_s)
         film = self.film
-        view = (
-            film.whole_view()
-            if self.animal is None
-            else film.near_view(film.row_at(time_s), self.animal)
-        )
-        shown = film.picture(time_s, view, _fitted(view.width, view.height, size), self.title)
+        time_s = min(self.start_s + after_s, self.stop_s)
+        if self.animal is None:
+            view = film.whole_view()
+        else:
+            view = film.near_view(film.row_at(time_s), self.animal)
+        shown = film.image(time_s, view, _fitted(view.width, view.height, size), self.title)
         placed = np.full((size[1], size[0], 3), _PAPER, np.uint8)
-        y = (size[1] - shown.shape[0]) // 2
-        x = (size[0] - shown.shape[1]) // 2
+        y, x = np.subtract(placed.shape[:2], shown.shape[:2]) // 2
         placed[y : y + shown.shape[0], x : x + shown.shape[1]] = shown
+        over = self.start_s + after_s > self.stop_s
         return (placed * _DIMMED).astype(np.uint8) if over else placed
 
 
@@ -228,7 +189,7 @@ def write_session(
         cell = Cell(film, low, high, session.name, 0 if near else None)
         view = film.whole_view()
         size = (480, 480) if near else _fitted(view.width, view.height, (_WHOLE_PX, _WHOLE_PX))
-        _write(path, film.fps, after_s, slower, lambda t: cell.picture(t, size), progress)
+        _write(path, film.fps, after_s, slower, lambda t: cell.image(t, size), progress)
     return path
 
 
@@ -268,14 +229,23 @@ def write_clips(
                 f"no bout is named {' or '.join(actions)} in {counted(len(sessions), 'session')}; "
                 f"named are {', '.join(map(str, known)) or 'none'}"
             )
-        chosen = {name: _evenly(cells, most) for name, cells in sorted(blocks.items()) if cells}
+        chosen = {}
+        for name, some in sorted(blocks.items()):
+            rows = np.linspace(0, len(some) - 1, min(most, len(some))).round().astype(int)
+            chosen |= {name: [some[k] for k in np.unique(rows)]} if some else {}
         cells = [cell for some in chosen.values() for cell in some]
         fps = max(cell.film.fps for cell in cells)
         longest = max(cell.stop_s - cell.start_s for cell in cells)
-        counts = {name: len(some) for name, some in blocks.items()}
-        grid = _Grid(chosen, counts, " or ".join(actions) or "session")
-        n = max(int(round(longest * fps * slower)), 1)
-        _write(path, fps, np.arange(n) / (fps * slower), slower, grid.picture, progress)
+        what = (" or ".join(actions) or "session").replace("_", " ")
+        heads = {}
+        for name, some in chosen.items():
+            total = len(blocks[name])
+            count = f"n = {len(some)} of {total}" if len(some) < total else f"n = {total}"
+            group = name or (NO_GROUP if len(chosen) > 1 else "")
+            heads[name] = ", ".join(filter(None, (group, what, count)))
+        n = max(round(longest * fps * slower), 1)
+        after_s = np.arange(n) / (fps * slower)
+        _write(path, fps, after_s, slower, lambda t: _grid(chosen, heads, t), progress)
     return path
 
 
@@ -284,43 +254,24 @@ def matches(word: str, actions: Iterable[str]) -> bool:
     return any(word == action or word.startswith(f"{action}_") for action in actions)
 
 
-class _Grid:
-    """Groups of clips next to each other, under headings with their n."""
-
-    def __init__(self, chosen: dict[str, list[Cell]], counts: dict[str, int], what: str) -> None:
-        self._chosen = chosen
-        self._counts = counts
-        self._what = what
-        n = max(len(cells) for cells in chosen.values())
-        self._columns = int(np.ceil(np.sqrt(n)))
-        self._rows = -(-n // self._columns)
-
-    def picture(self, after_s: float) -> NDArray[np.uint8]:
-        """All cells at a time after their beginnings, s."""
-        step = _CELL_PX + _GAP_PX
-        wide = self._columns * step + 4 * _GAP_PX
-        out = np.full(
-            (_HEAD_PX + self._rows * step, max(wide * len(self._chosen), 2 * step), 3),
-            _PAPER,
-            np.uint8,
-        )
-        for b, (group, cells) in enumerate(self._chosen.items()):
-            name = group or (NO_GROUP if len(self._chosen) > 1 else "")
-            shown = len(cells)
-            n = self._counts[group]
-            of = f"{shown} of {n}" if shown < n else f"{n}"
-            head = ", ".join(
-                part for part in (name, self._what.replace("_", " "), f"n = {of}") if part
-            )
-            write(out, head, b * wide + 4, 5, 15)
-            for k, cell in enumerate(cells):
-                row, column = divmod(k, self._columns)
-                x = b * wide + column * step
-                y = _HEAD_PX + row * step
-                out[y : y + _CELL_PX, x : x + _CELL_PX] = cell.picture(
-                    after_s, (_CELL_PX, _CELL_PX)
-                )
-        return out
+def _grid(
+    chosen: dict[str, list[Cell]], heads: dict[str, str], after_s: float
+) -> NDArray[np.uint8]:
+    """Groups of clips next to each other under headings, at a time after their beginnings, s."""
+    n = max(len(cells) for cells in chosen.values())
+    columns = int(np.ceil(np.sqrt(n)))
+    step = _CELL_PX + _GAP_PX
+    block = columns * step + 4 * _GAP_PX
+    width = max(block * len(chosen), 2 * step)
+    out = np.full((_HEAD_PX + -(-n // columns) * step, width, 3), _PAPER, np.uint8)
+    for b, (group, cells) in enumerate(chosen.items()):
+        write(out, heads[group], b * block + 4, 5, 15)
+        for k, cell in enumerate(cells):
+            row, column = divmod(k, columns)
+            x, y = b * block + column * step, _HEAD_PX + row * step
+            shown = cell.image(after_s, (_CELL_PX, _CELL_PX))
+            out[y : y + _CELL_PX, x : x + _CELL_PX] = shown
+    return out
 
 
 def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
@@ -329,20 +280,13 @@ def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
     if not actions:
         return [Cell(film, 0.0, end, film.session.name)]
     found = []
-    for animal, seen in enumerate(film.seen):
-        for row in seen.bouts.itertuples():
-            if matches(str(row.action), actions):
-                start = max(float(row.start_s) - _BEFORE_S, 0.0)  # type: ignore[arg-type]
-                stop = min(float(row.stop_s) + _AFTER_S, end)  # type: ignore[arg-type]
-                found.append(Cell(film, start, min(stop, start + _LONGEST_S), seen.who, animal))
+    for k, animal in enumerate(film.animals):
+        for bout in animal.bouts.to_dict("records"):
+            if matches(str(bout["action"]), actions):
+                start = max(float(bout["start_s"]) - _BEFORE_S, 0.0)
+                stop = min(float(bout["stop_s"]) + _AFTER_S, end, start + _LONGEST_S)
+                found.append(Cell(film, start, stop, animal.who, k))
     return found
-
-
-def _evenly(cells: list[Cell], most: int) -> list[Cell]:
-    """At most `most` cells, evenly spaced over all."""
-    if len(cells) <= most:
-        return cells
-    return [cells[int(k)] for k in np.unique(np.linspace(0, len(cells) - 1, most).round())]
 
 
 def _fitted(width: int, height: int, room: tuple[int, int]) -> tuple[int, int]:
@@ -356,15 +300,15 @@ def _write(
     fps: float,
     after_s: NDArray[np.float64],
     slower: float,
-    picture: Callable[[float], NDArray[np.uint8]],
+    image: Callable[[float], NDArray[np.uint8]],
     progress: Progress,
 ) -> None:
     """Write the images at the times (n,) s after the beginning, each shown at its time."""
     unlinked(path).parent.mkdir(parents=True, exist_ok=True)
     n = len(after_s)
-    with Video(path, fps) as video:
+    with video_file(path, fps) as add:
         for k, at_s in enumerate(after_s.tolist()):
             if k % 20 == 0:
                 progress(k, n, "drawing the video")
-            video.add(picture(at_s), slower * (at_s - after_s[0]))
+            add(image(at_s), slower * (at_s - after_s[0]))
         progress(n, n, "drawing the video")

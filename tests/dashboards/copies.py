@@ -11,12 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from liex_lab.dashboards.report.report import write_report
 
-from liex_lab.scene.scene import Arena
 from liex_lab.sessions import Session
 from liex_lab.sessions.folder import write_failure
-from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 GROUPS = (
     "control",
@@ -26,21 +23,10 @@ _OWN = ("session.json", "summary.csv", "sessions.parquet", "report.html")
 FAILED, WAITING = 1, 2  # the places of the sessions that are not done
 
 
-def session(folder: Path) -> Session:
-    """The session that the others are copies of: 6 s, a rear from 2 to 3 s, a gap, two frames
-    without a pose.
-    """
-    mouse = WalkingMouse(np.delete(steady(6.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(150, 151))
-    return write(
-        folder, mouse, name="first", report=write_report, arena=Arena("round", (0.0, 0.0), 220.0)
-    )
-
-
-def study(folder: Path, n_sessions: int) -> Path:
+def study(first: Session, folder: Path, n_sessions: int) -> Path:
     """A study file with its sessions: two per animal, the animals in two groups, one session
     failed, one waiting.
     """
-    first = session(folder / "first.liex")
     summary, rng = first.summary, np.random.default_rng(3)
     lines = ['name = "copies"', 'plan = "mouse"', 'results = "derivatives"']
     for k in range(0, n_sessions, 2):
@@ -81,8 +67,7 @@ def _copy(first: Session, place: Path, name: str, animal: str, summary: pd.DataF
         if path.is_file() and path.name not in _OWN:
             os.link(path, place / path.name)
     shutil.copy(first.path / "report.html", place)
-    missed = {"n_gaps": 1, "n_missing": 6}  # as a recording that was read would say
-    about = first.metadata | {"session_id": name, "frames": first.metadata["frames"] | missed}
+    about = first.metadata | {"session_id": name, "model": {}}
     (place / "session.json").write_text(json.dumps(about), encoding="utf-8")
     summary.assign(session_id=name).to_csv(place / "summary.csv", index=False)
     first.table("sessions").assign(session_id=name, subject_id=animal).to_parquet(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.dashboards.app.crossings import crossings
-from liex_lab.dashboards.figures.seen import animals
+from liex_lab.dashboards.app.desk import crossings
+from liex_lab.dashboards.figures.animals import session_animals
 
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
@@ -40,7 +41,7 @@ def put_flips(folder: Path, rows: Any = FLIPS) -> None:
 
 def found(folder: Path) -> list[dict[str, Any]]:
     session = Session.open(folder)
-    return crossings(session, animals(session))
+    return crossings(session, session_animals(session))
 
 
 def several(folder: Path) -> None:
@@ -54,20 +55,27 @@ def several(folder: Path) -> None:
     centre[30:33, 2:, 0] = 50.0
     score = np.zeros(centre.shape[:2], np.float32)
     score[:20, 2:], centre[:20, 2:] = np.nan, np.nan
-    np.savez_compressed(folder / "observations.npz", centroid_mm=centre, score=score)
+    subject = np.frombuffer(b"{}", np.uint8)
+    np.savez_compressed(
+        folder / "observations.npz", centroid_mm=centre, score=score, subject=subject
+    )
 
 
-def test_a_session_in_which_nothing_was_exchanged_has_no_crossing(tmp_path: Path) -> None:
-    write(tmp_path / "one.liex", MOUSE)
-    assert found(tmp_path / "one.liex") == []
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return write(tmp_path_factory.mktemp("crossings") / "one.liex", MOUSE)
 
 
-def test_exchanged_ends_are_told_in_words_and_near_ones_together(tmp_path: Path) -> None:
-    folder = tmp_path / "one.liex"
-    write(folder, MOUSE)
+@pytest.fixture
+def folder(written: Session, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(written.path, tmp_path / "one.liex"))
+
+
+def test_exchanged_ends_are_reported_in_words_and_near_ones_together(folder: Path) -> None:
+    assert found(folder) == []
     put_flips(folder)
     assert [(one["start_s"], one["stop_s"], one["why"]) for one in found(folder)] == [
-        (0.5, 0.8, "head and tail were exchanged and are put right, 2 times (p 0.99)"),
+        (0.5, 0.8, "head and tail were exchanged and are corrected, 2 times (p 0.99)"),
         (1.0, 1.2, "head and tail perhaps exchanged (p 0.34)"),
         (2.0, 2.5, "head and tail exchanged by a person"),
         (3.0, 3.1, "head and tail were exchanged by a person, who took it back"),
@@ -75,11 +83,10 @@ def test_exchanged_ends_are_told_in_words_and_near_ones_together(tmp_path: Path)
     assert {(one["kind"], one["individual"]) for one in found(folder)} == {("ends", "mouse_1")}
 
 
-def test_a_body_that_jumps_farther_than_it_can_go_may_be_another_thing(tmp_path: Path) -> None:
-    write(tmp_path / "one.liex", replace(MOUSE, lost=(60,)))
-    folder = tmp_path / "one.liex"
+def test_a_body_that_jumps_farther_than_it_can_go_may_be_another_object(folder: Path) -> None:
     path = folder / "kinematics.parquet"
     moved = pd.read_parquet(path)
+    moved.loc[60, ["x_mm", "y_mm"]] = np.nan
     moved.loc[90:, "x_mm"] += 300.0
     moved.to_parquet(path)
     (jump,) = found(folder)
@@ -106,10 +113,9 @@ def test_of_two_animals_in_view_each_place_where_the_other_may_be_followed_is_to
         found(folder)
 
 
-def test_two_animals_of_one_session_may_be_exchanged_where_they_meet(tmp_path: Path) -> None:
-    write(tmp_path / "one.liex", MOUSE)
-    session = Session.open(tmp_path / "one.liex")
-    (first,) = animals(session)
+def test_two_animals_of_one_session_may_be_exchanged_where_they_meet(written: Session) -> None:
+    session = Session.open(written.path)
+    (first,) = session_animals(session)
     second = replace(first, individual="mouse_2")
     second.__dict__["kinematics"] = first.kinematics.assign(
         x_mm=lambda table: table["x_mm"] + np.where(np.arange(len(table)) < 60, 500.0, 40.0)

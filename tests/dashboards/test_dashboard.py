@@ -12,19 +12,32 @@ import sys
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from urllib.request import urlopen
 
 import numpy as np
 import pandas as pd
 import pytest
+from flask import Flask
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.dashboards.app import tables
-from liex_lab.dashboards.app.data import GREY, NO_POSE, Ethogram, StudyData, colours_of, raster
-from liex_lab.dashboards.app.guard import MOST_BYTES
+from liex_lab.dashboards.app.data import (
+    _FACTS,
+    GREY,
+    NO_POSE,
+    Ethogram,
+    StudyData,
+    colours_of,
+    raster,
+)
 from liex_lab.dashboards.app.pages import ethogram_rows, moved_to
-from liex_lab.dashboards.app.server import address, make_app, serve
+from liex_lab.dashboards.app.server import (
+    MOST_BYTES,
+    address,
+    guard,
+    make_app,
+    serve,
+)
 from liex_lab.pipelines.study.run import list_sessions
 from typer.testing import CliRunner
 
@@ -36,11 +49,6 @@ from liex_lab.sessions.verdict import Entry
 from tests.dashboards import copies
 
 KEY = "sub-m003_ses-01"
-
-
-@pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return copies.study(tmp_path_factory.mktemp("study"), 24)
 
 
 @pytest.fixture(scope="module")
@@ -61,32 +69,36 @@ def test_every_session_of_the_study_is_listed_with_its_state_and_quality(data: S
 
 
 def test_a_folder_of_sessions_needs_no_study_file_and_older_tables_are_no_sessions(
-    study: Path, tmp_path: Path
+    walker: Session, tmp_path: Path
 ) -> None:
-    one = tmp_path / "one.liex"
-    shutil.copytree(study.parent / "first.liex", one)
+    one = Path(shutil.copytree(walker.path, tmp_path / "one.liex"))
     (one / "as_tracked").mkdir()
     shutil.copy(one / "session.json", one / "as_tracked")
     shutil.copytree(one, tmp_path / "two.liex")
     name, look = list_sessions(tmp_path)
     assert name == tmp_path.name
-    assert [(entry.key, entry.state) for entry in look()] == [
-        ("one.liex", "done"),
-        ("two.liex", "done"),
-    ]
+    keys = ["one.liex", "two.liex"]
+    assert [(entry.key, entry.state) for entry in look()] == [(key, "done") for key in keys]
     with pytest.raises(LiexError, match="no study"):
         list_sessions(tmp_path / "nowhere")
 
 
-def test_a_session_that_is_written_again_is_read_again(study: Path, tmp_path: Path) -> None:
-    shutil.copytree(study.parent / "first.liex", tmp_path / "s.liex")
-    data = StudyData(*list_sessions(tmp_path))
-    assert data.overview()["n_gaps"].tolist() == [0]
-    document = tmp_path / "s.liex" / "session.json"
-    about = json.loads(document.read_text())
+def test_a_session_that_is_written_again_is_read_and_compared_again(
+    walker: Session, tmp_path: Path
+) -> None:
+    data = StudyData(*list_sessions(copies.study(walker, tmp_path, 8)))
+    assert set(data.overview()["n_gaps"].dropna()) == {1}
+    before = data.stats("mean_speed_mm_s")
+    assert data.stats("mean_speed_mm_s") is before
+    folder = data.done[0].folder
+    assert folder is not None
+    about = json.loads((folder / "session.json").read_text())
     about["frames"]["n_gaps"] = 77
-    document.write_text(json.dumps(about))
-    assert data.overview()["n_gaps"].tolist() == [77]
+    (folder / "session.json").write_text(json.dumps(about))
+    summary = pd.read_csv(folder / "summary.csv")
+    summary.assign(mean_speed_mm_s=900.0).to_csv(folder / "summary.csv", index=False)
+    assert set(data.overview()["n_gaps"].dropna()) == {1, 77}
+    assert not data.stats("mean_speed_mm_s").equals(before)
 
 
 @settings(max_examples=30)
@@ -387,75 +399,40 @@ def test_what_is_not_there_is_told(data: StudyData) -> None:
         tables.find(data, "nothing")
 
 
-def test_every_ethogram_stands_under_its_own_key(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_ethograms_are_of_measured_sessions_alone(data: StudyData) -> None:
+    asked = ["sub-m005_ses-02", "sub-m000_ses-02", "sub-m001_ses-01", "nobody", KEY]
+    assert list(data.ethograms(asked)) == ["sub-m005_ses-02", KEY]
+
+
+def test_a_session_that_cannot_be_read_in_any_way_is_a_sentence_in_its_row(
+    own: Session, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    entries = [
-        Entry("a", "failed", folder=tmp_path / "a"),
-        Entry("b", "done", folder=tmp_path / "b"),
-        Entry("c", "new"),
-        Entry("d", "done", folder=tmp_path / "d"),
-    ]
-    shown = StudyData("x", lambda: entries)
-    known = {
-        key: Ethogram(np.zeros((0, 2)), [], np.zeros((0, 2)), seconds)
-        for key, seconds in (("b", 2.0), ("d", 4.0))
-    }
-    monkeypatch.setattr(shown, "_of_one", lambda what, read, entry: known[entry.key])
-    found = shown.ethograms(["a", "b", "c", "d", "e"])
-    assert {key: one.duration_s for key, one in found.items()} == {"b": 2.0, "d": 4.0}
-
-
-def test_a_damaged_ethogram_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = StudyData("x", lambda: [Entry("b", "done", folder=tmp_path / "b")])
-    monkeypatch.setattr(shown, "_of_one", lambda what, read, entry: {"damage": "run it again"})
-    assert shown.ethograms(["b"]) == {}
-    assert shown.damage("b") == "run it again"
-
-
-def test_a_session_that_cannot_be_read_in_any_way_is_a_sentence_in_its_row(tmp_path: Path) -> None:
-    shown = StudyData("x", lambda: [Entry("b", "done", folder=tmp_path / "b")])
-    (tmp_path / "b").mkdir()
-
-    def breaks(session: object) -> object:
+    def breaks(session: Session) -> object:
         raise ZeroDivisionError("a\nslip")
 
-    (entry,) = shown.done
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("liex_lab.sessions.Session.open", lambda folder: folder)
-        found = shown._of_one("quality", breaks, entry)
-    assert "cannot be shown (ZeroDivisionError: a)" in found["damage"]
-    assert "liex verify" in found["damage"]
+    monkeypatch.setitem(_FACTS, "quality", breaks)
+    shown = StudyData(*list_sessions(own.path.parent))
+    (damage,) = shown.overview()["damage"]
+    assert "cannot be shown (ZeroDivisionError: a)" in damage
+    assert "liex verify" in damage
 
 
 @pytest.mark.parametrize("origin", ["http://[", "http://[::1", "//", "\\"])
 def test_an_origin_that_is_no_address_is_refused(origin: str) -> None:
-    from flask import Flask
-    from liex_lab.dashboards.app.guard import guard
-
     server = Flask("test")
     guard(server, "")
     answer = server.test_client().get("/", headers={"Origin": origin, "Host": "127.0.0.1"})
     assert answer.status_code == 403
 
 
-def test_a_report_that_is_a_link_elsewhere_is_not_shown(tmp_path: Path) -> None:
-    from flask import Flask
-    from liex_lab.dashboards.app.guard import add_downloads
-
-    folder = tmp_path / "b"
-    folder.mkdir()
+def test_a_report_that_is_a_link_elsewhere_is_not_shown(own: Session, tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("secret")
-    shown = StudyData("x", lambda: [Entry("b", "done", folder=folder)])
-    server = Flask("test")
-    add_downloads(server, shown)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shown, "session", lambda key: SimpleNamespace(path=folder))
-        (folder / "report.html").write_text("fine")
-        assert server.test_client().get("/report/b").text == "fine"
-        (folder / "report.html").unlink()
-        (folder / "report.html").symlink_to(tmp_path / "secret")
-        assert server.test_client().get("/report/b").status_code == 404
+    browser = make_app(StudyData(*list_sessions(own.path.parent))).test_client()
+    address, report = f"/report/{own.name}", own.path / "report.html"
+    assert browser.get(address).text == report.read_text(encoding="utf-8")
+    report.unlink()
+    report.symlink_to(tmp_path / "secret")
+    assert browser.get(address).status_code == 404
 
 
 def test_a_session_that_is_corrected_while_it_is_read_is_read_again(

@@ -4,7 +4,6 @@ exchanged, playing, taking back, doubtful places and crossings one after the oth
 
 from __future__ import annotations
 
-import shutil
 import time
 from pathlib import Path
 
@@ -15,17 +14,13 @@ from playwright.sync_api import Locator, Page, Route, expect
 
 from liex_lab.api import run_session
 from liex_lab.plan import Plan
-from liex_lab.scene.scene import Arena
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import read_log
-from tests.dashboards.conftest import Watched, until
+from tests.dashboards.conftest import KEY, MOUSE, Watched, fits_a_phone, until
 from tests.dashboards.served import Served
-from tests.dashboards.test_crossings import put_flips
-from tests.sessions.walking_mouse import WalkingMouse, steady, write
+from tests.dashboards.test_crossings import FLIPS, put_flips
 
-KEY = "walker"
 TRACKED = "synthetic:walk?seed=3&frames=30&sensor=primesense-qvga&spine_mm=70"
-MOUSE = WalkingMouse(np.delete(steady(6.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(150, 151))
 
 
 def suggest(folder: Path) -> pd.DataFrame:
@@ -35,30 +30,17 @@ def suggest(folder: Path) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("written") / f"{KEY}.liex"
-    return write(place, MOUSE, name=KEY, arena=Arena("round", (0, 0), 220.0)).path
-
-
-@pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Served:
     """A session whose track can be made again, for it keeps what its single frames said."""
     plan = Plan.load("mouse").with_settings(["animal.spine_mm=70", f"session.name={KEY}"])
     folder = tmp_path_factory.mktemp("measured")
     run_session(TRACKED, plan, folder)
-    return folder / f"{KEY}.liex"
+    return Served(folder)
 
 
 @pytest.fixture
-def served(written: Path, tmp_path: Path) -> Served:
-    shutil.copytree(written, tmp_path / "study" / f"{KEY}.liex")
-    return Served(tmp_path / "study", suggest=suggest)
-
-
-@pytest.fixture
-def tracked(measured: Path, tmp_path: Path) -> Served:
-    shutil.copytree(measured, tmp_path / "study" / f"{KEY}.liex")
-    return Served(tmp_path / "study")
+def served(own: Session) -> Served:
+    return Served(own.path.parent, suggest=suggest)
 
 
 def opened(served: Served, page: Page, at_s: float) -> Locator:
@@ -127,13 +109,17 @@ def test_a_joint_is_dragged_and_its_frame_follows(served: Served, watched: Watch
             == pytest.approx((x - 20, y + 8), abs=1.2 * scale)
         ),
     )
+    page.keyboard.press("u")
+    expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
     watched.nothing_went_wrong()
+    dragged_off_the_animal(served, page)
+    page.keyboard.press("r")
+    expect(page.locator(".desk-said")).to_contain_text("nothing was taken back since the last")
 
 
-def test_a_joint_dragged_off_the_animal_shows_that_its_height_is_kept_and_redo_makes_it_again(
-    served: Served, watched: Watched
-) -> None:
-    page, row, said = watched.page, 75, watched.page.locator(".desk-said")
+def dragged_off_the_animal(served: Served, page: Page) -> None:
+    """The height is kept, and the page shows it; what was taken back is made again."""
+    row, said = 75, page.locator(".desk-said")
     stage = opened(served, page, float(MOUSE.times_s[row]))
     nose = session(served).poses.iloc[5 * row + 4]
     x, y = at_rest(page, stage, row, 4)
@@ -155,17 +141,11 @@ def test_a_joint_dragged_off_the_animal_shows_that_its_height_is_kept_and_redo_m
     expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
     expect(page.locator("#correct-made")).to_contain_text("Redo: nose of frame")
     page.keyboard.press("r")
-    page.keyboard.press("r")
-    expect(said).to_contain_text("nothing was taken back since the last new correction")
-    watched.complaints.clear()  # of the refusal
+    expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
 
 
-def test_bands_and_doubts_are_above_the_fold_and_a_click_leaves_the_keys_to_the_page(
-    served: Served, watched: Watched
-) -> None:
-    page = watched.page
-    page.goto(f"{served.address}/session/{KEY}")
-    page.wait_for_selector("#desk.is-open")
+def bands_and_doubts_are_above_the_fold(page: Page) -> None:
+    """And a click leaves the keys to the page."""
     expect(page.locator(".desk-doubts li")).not_to_have_count(0)
     for part in (".desk-bar >> nth=0", ".desk-all", ".desk-doubts"):
         box = page.locator(part).bounding_box()
@@ -175,14 +155,43 @@ def test_bands_and_doubts_are_above_the_fold_and_a_click_leaves_the_keys_to_the_
     page.keyboard.press(" ")
     expect(page.locator(".desk-play")).to_contain_text("Pause")
     expect(page.locator(".desk-keys")).to_have_attribute("open", "")
-    watched.nothing_went_wrong()
+    page.keyboard.press(" ")
+    expect(page.locator(".desk-play")).to_contain_text("Play")
+
+
+def fits_a_phone_in_the_dark(page: Page) -> None:
+    page.emulate_media(color_scheme="dark")
+    assert fits_a_phone(page)
+    ink, paper = (
+        sum(int(part) for part in colour.removeprefix("rgb(").rstrip(")").split(","))
+        for colour in page.evaluate(
+            "(of => [of.color, of.backgroundColor])(getComputedStyle(document.body))"
+        )
+    )
+    assert ink > paper + 300
+
+
+def keys_belong_to_a_field(page: Page) -> None:
+    page.get_by_text("Correct by a sentence").click()
+    page.locator("#correct-sentence").fill("")
+    page.locator("#correct-sentence").type("f 1u")
+    expect(page.locator("#correct-sentence")).to_have_value("f 1u")
+    expect(page.locator(".desk-play")).to_contain_text("Play")
+    page.locator("#correct-sentence").fill("")
+    page.get_by_text("Correct by a sentence").click()
 
 
 def test_an_action_is_named_by_a_key_and_taken_back_by_another(
     served: Served, watched: Watched
 ) -> None:
     page = watched.page
+    page.goto(f"{served.address}/session/{KEY}")
+    page.wait_for_selector("#desk.is-open")
+    bands_and_doubts_are_above_the_fold(page)
     opened(served, page, 1.0)
+    keys_belong_to_a_field(page)
+    assert read_log(served.study / f"{KEY}.liex").entries == ()
+    page.locator(".desk-stage").click()
     was = session(served).bouts["action"].tolist()
     words = page.locator(".desk-actions button").evaluate_all("all => all.map(a => a.dataset.word)")
     new = next(word for word in words if word not in was)
@@ -210,6 +219,7 @@ def test_an_action_is_named_by_a_key_and_taken_back_by_another(
     page.keyboard.press("f")  # head and tail: this session has nothing to make the track of again
     expect(page.locator(".desk-said.is-wrong")).to_be_visible()
     assert len(read_log(served.study / f"{KEY}.liex").standing) == 1
+    fits_a_phone_in_the_dark(page)
     watched.nothing_went_wrong()
 
 
@@ -246,16 +256,28 @@ def test_f_exchanges_head_and_tail_in_the_marked_span_and_u_takes_it_back(
     page.keyboard.press("u")
     expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
     np.testing.assert_array_equal(to_nose(tracked), before)
+    held = list[Route]()
+    page.route("**/crossings", lambda route: held.append(route))
     page.keyboard.press("F")  # with Shift, and where nothing is marked: this frame alone
     expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged in frames")
     expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    until(page, lambda: bool(held))
+    page.keyboard.press("x")  # right after a correction: one of the new ones
+    expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
+    held.pop().continue_()
+    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged by a person")
     watched.nothing_went_wrong()
 
 
 def test_it_plays_at_the_pace_that_is_asked_for(served: Served, watched: Watched) -> None:
-    page = watched.page
+    page, asked = watched.page, list[str]()
+    page.on("request", lambda request: asked.append(request.url.removeprefix(served.address)))
     opened(served, page, 0.0)
+    images = [address for address in asked if "/frame/0.png" in address]
+    assert images == [f"/desk/{KEY}/frame/0.png?box=0,0,65536,65536"]
     page.wait_for_selector("#frame-facts dd")
+    assert asked.index(images[0]) < asked.index(f"/whole/{KEY}")  # the image before the figures
+    assert asked.count(f"/desk/{KEY}/about") == 1
     clock = page.locator(".desk-clock")
 
     def now() -> float:
@@ -289,9 +311,19 @@ def test_it_plays_at_the_pace_that_is_asked_for(served: Served, watched: Watched
     watched.nothing_went_wrong()
 
 
-def test_places_in_doubt_are_worked_off_and_stay_so(served: Served, watched: Watched) -> None:
-    page = watched.page
-    opened(served, page, 0.0)
+def test_doubts_and_crossings_are_gone_to_one_after_the_other_and_stay_so(
+    served: Served, watched: Watched
+) -> None:
+    put_flips(served.study / f"{KEY}.liex", FLIPS[:2] + FLIPS[3:])
+    page, held = watched.page, list[Route]()
+    page.route("**/crossings", lambda route: held.append(route))
+    with page.expect_request("**/crossings"):
+        opened(served, page, 0.0)
+    page.keyboard.press("x")  # too early: gone to once it is found
+    expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
+    held.pop().continue_()
+    expect(page.locator(".desk-said")).to_contain_text("crossing 1 of 3, 0.50 to 0.80 s")
+    page.unroute("**/crossings")
     listed = page.locator(".desk-doubts li")
     expect(listed).to_have_count(2)
     assert "<b>walk</b> or pause?" in listed.nth(1).inner_text()  # names are text
@@ -307,103 +339,15 @@ def test_places_in_doubt_are_worked_off_and_stay_so(served: Served, watched: Wat
     expect(page.locator(".desk-said")).to_contain_text("4.00 to 4.50 s")
     page.keyboard.press("k")
     expect(page.locator(".desk-said")).to_contain_text("all places in doubt have been looked at")
-    watched.nothing_went_wrong()
-
-
-def test_crossings_are_gone_to_by_a_key_and_by_buttons_and_told_in_words(
-    served: Served, watched: Watched
-) -> None:
-    put_flips(served.study / f"{KEY}.liex")
-    page = watched.page
-    opened(served, page, 0.0)
     side, said = page.locator(".desk-side"), page.locator(".desk-said")
-    expect(side.locator(".desk-crossings")).to_have_text("4 in all")
+    expect(side.locator(".desk-crossings")).to_have_text("3 in all")
     page.keyboard.press("x")
-    expect(said).to_contain_text("crossing 1 of 4, 0.50 to 0.80 s: head and tail were exchanged")
+    expect(said).to_contain_text("from the beginning again: crossing 1 of 3, 0.50 to 0.80 s")
     expect(page.locator(".desk-clock")).to_contain_text("0.500 s")
     side.get_by_role("button", name="Next crossing").click()
-    expect(said).to_contain_text("crossing 2 of 4, 1.00 to 1.20 s: head and tail perhaps exchanged")
+    expect(said).to_contain_text("crossing 2 of 3, 2.00 to 2.50 s: head and tail exchanged by a")
     page.keyboard.press("Shift+X")
-    expect(said).to_contain_text("crossing 1 of 4")
+    expect(said).to_contain_text("crossing 1 of 3")
     side.get_by_role("button", name="previous crossing").click()
-    expect(said).to_contain_text("from the end again: crossing 4 of 4")
-    page.keyboard.press("x")
-    expect(said).to_contain_text("from the beginning again: crossing 1 of 4")
-    watched.nothing_went_wrong()
-
-
-def test_a_crossing_asked_for_too_early_is_gone_to_once_it_is_found(
-    served: Served, watched: Watched
-) -> None:
-    put_flips(served.study / f"{KEY}.liex")
-    page, held = watched.page, list[Route]()
-    page.route("**/crossings", lambda route: held.append(route))
-    with page.expect_request("**/crossings"):
-        opened(served, page, 0.0)
-    page.keyboard.press("x")
-    expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
-    held.pop().continue_()
-    expect(page.locator(".desk-said")).to_contain_text("crossing 1 of 4, 0.50 to 0.80 s")
-    watched.nothing_went_wrong()
-
-
-def test_a_crossing_asked_for_right_after_a_correction_is_one_of_the_new_ones(
-    tracked: Served, watched: Watched
-) -> None:
-    page, held = watched.page, list[Route]()
-    with page.expect_response("**/crossings"):
-        opened(tracked, page, 0.3)
-    page.route("**/crossings", lambda route: held.append(route))
-    page.keyboard.press("F")
-    until(page, lambda: bool(held))
-    page.keyboard.press("x")
-    expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
-    held.pop().continue_()
-    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged by a person")
-    watched.nothing_went_wrong()
-
-
-def test_keys_belong_to_a_field_while_one_types_into_it(served: Served, watched: Watched) -> None:
-    page = watched.page
-    opened(served, page, 1.0)
-    page.get_by_text("Correct by a sentence").click()
-    page.locator("#correct-sentence").fill("")
-    page.locator("#correct-sentence").type("f 1u")
-    expect(page.locator("#correct-sentence")).to_have_value("f 1u")
-    assert read_log(served.study / f"{KEY}.liex").entries == ()
-    expect(page.locator(".desk-play")).to_contain_text("Play")
-    watched.nothing_went_wrong()
-
-
-def test_the_page_stays_in_place_on_a_phone_and_in_the_dark(
-    served: Served, watched: Watched
-) -> None:
-    page = watched.page
-    page.set_viewport_size({"width": 390, "height": 800})
-    page.emulate_media(color_scheme="dark")
-    opened(served, page, 1.0)
-    page.wait_for_selector("#frame-facts dd")
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    ink, paper = (
-        sum(int(part) for part in colour.removeprefix("rgb(").rstrip(")").split(","))
-        for colour in page.evaluate(
-            "(of => [of.color, of.backgroundColor])(getComputedStyle(document.body))"
-        )
-    )
-    assert ink > paper + 300
-    watched.nothing_went_wrong()
-
-
-def test_the_first_picture_is_asked_for_before_the_figures(
-    served: Served, watched: Watched
-) -> None:
-    page = watched.page
-    asked: list[str] = []
-    page.on("request", lambda request: asked.append(request.url.removeprefix(served.address)))
-    opened(served, page, 1.0)
-    pictures = [address for address in asked if "/frame/30.png" in address]
-    assert pictures == [f"/desk/{KEY}/frame/30.png?box=0,0,65536,65536"]
-    page.wait_for_selector("#frame-facts dd")
-    assert asked.index(pictures[0]) < asked.index(f"/whole/{KEY}")
-    assert asked.count(f"/desk/{KEY}/about") == 1
+    expect(said).to_contain_text("from the end again: crossing 3 of 3")
     watched.nothing_went_wrong()

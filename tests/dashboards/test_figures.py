@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,10 +12,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.dashboards.figures import actions, groups, places, sets, times
-from liex_lab.dashboards.figures.seen import DepthReader, Seen, animals
-from liex_lab.dashboards.figures.style import drawing, image_bytes, on_page, scale_bar, sheet
-from liex_lab.dashboards.report.contact_sheet import picture, shade
+from liex_lab.dashboards.figures import groups, places, sets, times
+from liex_lab.dashboards.figures.animals import DepthImages, SessionAnimal, session_animals
+from liex_lab.dashboards.figures.style import (
+    drawing,
+    image_bytes,
+    joined,
+    on_page,
+    scale_bar,
+    sheet,
+)
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.text import Text
@@ -22,27 +30,21 @@ from liex_lab.actions.vocabulary import action_colours
 from liex_lab.api import compare_groups, draw_figures
 from liex_lab.behaviour.cohort import compare
 from liex_lab.errors import PlaceError, SessionError
-from liex_lab.plan import Plan
 from liex_lab.scene.scene import Arena
-from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
 
-MOUSE = WalkingMouse(steady(9.0), rear_s=(2.0, 3.0), lost=(60, 61))
-BOWL = Arena("round", (0.0, 0.0), 210.0, None, None, 0.5, 1.0, "wall")
-NEST = Zone("nest <1>", circle_mm=(100.0, 0.0, 60.0))
+BOWL = Arena("round", (0.0, 0.0), 220.0)
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    return write(
-        tmp_path_factory.mktemp("figures") / "circle.liex", MOUSE, arena=BOWL, zones=(NEST,)
-    )
+def session(walker: Session) -> Session:
+    return Session.open(walker.path)
 
 
 @pytest.fixture(scope="module")
-def seen(session: Session) -> Seen:
-    (one,) = animals(session)
+def animal(session: Session) -> SessionAnimal:
+    (one,) = session_animals(session)
     return one
 
 
@@ -57,29 +59,28 @@ def numbers(pattern: str, figure: Any) -> list[int]:
     return [int(n.replace(",", "")) for n in re.findall(pattern, text_of(figure))]
 
 
-def test_the_time_on_the_map_is_the_observed_time(session, seen):
-    found = places.occupancy_of(seen)
+def test_the_time_on_the_map_is_the_observed_time(session, animal):
+    found = places.occupancy_of(animal)
     assert found.observed_s == pytest.approx(session.summary["observed_s"].iloc[0], rel=1e-6)
-    assert f"{found.observed_s:.1f} s observed" in text_of(places.occupancy_map(seen))
+    assert f"{found.observed_s:.1f} s observed" in text_of(places.occupancy_map(animal))
 
 
-def test_every_n_of_a_title_is_that_of_the_table(session, seen):
+def test_every_n_of_a_title_is_that_of_the_table(session, animal):
     posed = int(np.isfinite(session.kinematics["x_mm"]).sum())
-    assert posed == 268
-    assert numbers(r"n = ([\d,]+) frames", places.occupancy_map(seen)) == [posed]
-    assert numbers(r"n = ([\d,]+) frames", places.trajectory(seen)) == [posed]
-    assert numbers(r"n = ([\d,]+) bouts?", times.ethogram(seen)) == [len(session.bouts)]
-    assert numbers(r"n = ([\d,]+) bouts?", actions.time_budget(seen)) == [len(session.bouts)]
+    assert posed == 172
+    assert numbers(r"n = ([\d,]+) frames", places.occupancy_map(animal)) == [posed]
+    assert numbers(r"n = ([\d,]+) frames", places.trajectory(animal)) == [posed]
+    assert numbers(r"n = ([\d,]+) bouts?", times.ethogram(animal)) == [len(session.bouts)]
+    assert numbers(r"n = ([\d,]+) bouts?", times.time_budget(animal)) == [len(session.bouts)]
     n = int(session.table("transitions")["n"].sum())
-    assert numbers(r"n = ([\d,]+) transitions?", actions.transitions(seen)) == [n]
+    assert numbers(r"n = ([\d,]+) transitions?", times.transitions(animal)) == [n]
     known = int(np.isfinite(session.kinematics["speed_mm_s"]).sum())
-    assert numbers(r"n = ([\d,]+) frames", times.speed_distribution(seen)) == [known]
+    assert numbers(r"n = ([\d,]+) frames", times.speed_distribution(animal)) == [known]
 
 
-def test_a_scale_bar_is_as_long_as_it_says(seen):
+def test_a_scale_bar_is_as_long_as_it_says(animal):
     with drawing():
-        figure = places.trajectory(seen)
-        assert figure is not None
+        figure = places.trajectory(animal)
         axes = figure.axes[0]
         (bar,) = [line for line in axes.get_lines() if line.get_gid() == "scale-bar"]
         (said,) = [text.get_text() for text in axes.texts if text.get_text().endswith("mm")]
@@ -89,7 +90,7 @@ def test_a_scale_bar_is_as_long_as_it_says(seen):
         (walls,) = [line for line in axes.get_lines() if line.get_gid() == "arena"]
         paper = axes.transData.transform(np.column_stack(walls.get_data()))
         bar_px = np.ptp(axes.transData.transform(np.column_stack(bar.get_data()))[:, 0])
-        assert np.ptp(paper[:, 0]) / bar_px == pytest.approx(2 * 210.0 / float(mm), rel=0.01)
+        assert np.ptp(paper[:, 0]) / bar_px == pytest.approx(2 * 220.0 / float(mm), rel=0.01)
 
 
 @pytest.mark.parametrize("extent", [30.0, 420.0, 1500.0, 9000.0])
@@ -100,62 +101,47 @@ def test_a_scale_bar_fits_its_panel(extent):
         assert 0.0 < scale_bar(axes) < 0.5 * extent
 
 
-def test_the_shares_of_the_budget_are_those_of_the_summary(session, seen):
-    with drawing():
-        figure = actions.time_budget(seen)
-    assert figure is not None
-    drawn = [bar.get_width() for bar in figure.axes[0].patches]
-    row = session.summary.iloc[0]
-    words = [*seen.words, "unlabelled"]
-    np.testing.assert_allclose(drawn, [100.0 * row[f"{word}_share"] for word in words])
-
-
-def test_an_action_has_its_colour_in_every_figure(session, seen):
-    colours = action_colours(seen.words)
+def test_an_action_has_its_colour_in_every_figure(session, animal):
+    colours = action_colours(animal.words)
     seen_words = set(session.bouts["action"])
     with drawing():
-        for draw in (times.ethogram, actions.time_budget, actions.activity, actions.transitions):
-            svg = image_bytes(draw(seen), "svg").decode().lower()
+        for draw in (times.ethogram, times.time_budget, times.activity, times.transitions):
+            svg = image_bytes(draw(animal), "svg").decode().lower()
             assert all(colours[str(word)].lower() in svg for word in seen_words), draw
 
 
-def test_a_rear_is_shaded_in_the_colour_of_its_name_and_the_curve_keeps_its_own(session, seen):
+def test_a_rear_is_shaded_in_the_colour_of_its_name_and_the_curve_keeps_its_own(session, animal):
     with drawing():
-        figure = times.curves(seen)
+        figure = times.curves(animal)
     assert figure is not None
     (axes,) = [one for one in figure.axes if "Nose height" in one.get_title(loc="left")]
     rears = session.bouts[session.bouts["action"].str.startswith("rear")]
-    colours = action_colours(seen.words)
+    colours = action_colours(animal.words)
     shades = [to_hex(patch.get_facecolor()) for patch in axes.patches]
     assert shades == [colours[word].lower() for word in rears["action"]]
     assert len(shades) == 1
     assert to_hex(axes.get_lines()[0].get_color()) not in shades
 
 
-def test_a_bar_of_the_ethogram_stands_at_its_time(session, seen):
+def test_bars_ways_and_shares_are_those_of_the_tables(session, animal):
     with drawing():
-        figure = times.ethogram(seen)
-    assert figure is not None
+        ethogram, budget, speed = (
+            draw(animal) for draw in (times.ethogram, times.time_budget, times.speed_distribution)
+        )
     word = str(session.bouts["action"].iloc[0])
     own = session.bouts[session.bouts["action"] == word]
-    (bars,) = [c for c in figure.axes[0].collections if c.get_gid() == f"bouts of {word}"]
+    (bars,) = [c for c in ethogram.axes[0].collections if c.get_gid() == f"bouts of {word}"]
     drawn = sorted(
         (path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in bars.get_paths()
     )
     np.testing.assert_allclose(drawn, own[["start_s", "stop_s"]].to_numpy(float))
-
-
-def test_the_way_summed_up_is_the_distance_of_the_summary(session, seen):
-    _, metres, _ = times.walked(seen)
-    assert metres[-1] == pytest.approx(session.summary["distance_m"].iloc[0], rel=1e-6)
+    row = session.summary.iloc[0]
+    shares = [100.0 * row[f"{word}_share"] for word in [*animal.words, "unlabelled"]]
+    np.testing.assert_allclose([bar.get_width() for bar in budget.axes[0].patches], shares)
+    _, metres, _ = times.walked(animal)
+    assert metres[-1] == pytest.approx(row["distance_m"], rel=1e-6)
     assert (np.diff(metres) >= 0).all()
-
-
-def test_the_distribution_holds_all_of_the_time(seen):
-    with drawing():
-        figure = times.speed_distribution(seen)
-    assert figure is not None
-    assert sum(bar.get_height() for bar in figure.axes[0].patches) == pytest.approx(100.0)
+    assert sum(bar.get_height() for bar in speed.axes[0].patches) == pytest.approx(100.0)
 
 
 def test_a_long_curve_keeps_its_peaks_and_its_holes():
@@ -170,8 +156,8 @@ def test_a_long_curve_keeps_its_peaks_and_its_holes():
 
 def test_bouts_nearer_than_a_hair_are_one_bar():
     spans = [(0.0, 1.0), (1.01, 1.02), (5.0, 6.0)]
-    assert times.joined(spans, 0.05) == [(0.0, 1.02), (5.0, 6.0)]
-    assert times.joined(spans, 0.0) == spans
+    assert joined(spans, 0.05) == [(0.0, 1.02), (5.0, 6.0)]
+    assert joined(spans, 0.0) == spans
 
 
 def test_the_arenas_floor_is_at_height_zero_and_a_fixture_as_high_as_it_is(session):
@@ -201,15 +187,15 @@ def test_the_region_and_where_the_animal_hid_are_drawn_on_the_floor(session):
             "stop_s": [3.5, 1.0, 5.0],
         }
     )
-    seen: Any = SimpleNamespace(
+    animal: Any = SimpleNamespace(
         camera=camera,
         T_arena_camera=session.T_arena_camera,
         metadata={"scene": {"region_px": [foot, aside, [camera.cx, 0.0]]}},
         gaps=gaps,
     )
     axes = Figure().add_subplot()
-    places.draw_region(axes, seen)
-    places.draw_hidden(axes, seen)
+    places.draw_region(axes, animal)
+    places.draw_hidden(axes, animal)
     (region,) = [line for line in axes.get_lines() if line.get_gid() == "region"]
     corners = np.column_stack(region.get_data())
     np.testing.assert_allclose(corners[0], 0.0, atol=1e-6)  # below the camera
@@ -220,29 +206,31 @@ def test_the_region_and_where_the_animal_hid_are_drawn_on_the_floor(session):
 
 
 def test_the_animal_is_not_in_the_map_of_the_arena(session):
-    with DepthReader(session) as reader:
-        pictures = [reader.picture(row) for row in range(0, 270, 30)]
-    heights, _, _ = places.arena_heights(session, [one for one in pictures if one is not None])
+    with closing(DepthImages()) as images:
+        depths = [images.depth(session, row) for row in range(0, 174, 20)]
+    heights, _, _ = places.arena_heights(session, [one for one in depths if one is not None])
     assert np.nanmax(heights) < 15.0  # the mouse is 25 mm high
 
 
 def test_what_the_tables_say_twice_is_the_same_bytes(session, tmp_path):
-    some = ["occupancy", "ethogram", "transitions"]
-    asked: Any = {"only": some, "formats": ("svg", "pdf", "png")}
-    first = draw_figures(session.path, out=tmp_path / "a", **asked)
-    again = draw_figures(session.path, out=tmp_path / "b", **asked)
-    assert len(first["files"]) == 9
+    asked: Any = {
+        "only": ["occupancy", "transitions"],
+        "formats": ("svg", "pdf", "png", "pages"),
+    }
+    first, again = (draw_figures(session.path, out=tmp_path / name, **asked) for name in "ab")
+    assert len(first["files"]) == 7
     for one, other in zip(first["files"], again["files"], strict=True):
         assert one.read_bytes() == other.read_bytes(), one.name
-
-
-def test_pages_are_one_pdf_of_all_figures(session, tmp_path):
-    asked: Any = {"only": ["occupancy", "speed"], "formats": ["pages"]}
-    first = draw_figures(session.path, out=tmp_path / "a", **asked)
-    again = draw_figures(session.path, out=tmp_path / "b", **asked)
-    assert first["files"] == [tmp_path / "a" / "figures.pdf"]
-    assert first["files"][0].read_bytes() == again["files"][0].read_bytes()
-    assert b"/Count 2" in first["files"][0].read_bytes()
+    assert first["files"][-1] == tmp_path / "a" / "figures.pdf"
+    assert b"/Count 2" in first["files"][-1].read_bytes()
+    svg = (tmp_path / "a" / "occupancy.svg").read_text(encoding="utf-8")
+    assert "Occupancy, walker" in svg
+    assert ">nest &lt;1&gt;</text>" in svg  # a text that can be edited
+    assert 'width="252.' in svg  # 89 mm in points
+    assert "Date" not in svg
+    pdf = (tmp_path / "a" / "occupancy.pdf").read_bytes()
+    assert b"/Type3" not in pdf
+    assert b"CreationDate" not in pdf
 
 
 def test_a_report_made_again_draws_anew_what_lies_beside_it(session, tmp_path):
@@ -258,15 +246,12 @@ def test_a_report_made_again_draws_anew_what_lies_beside_it(session, tmp_path):
     assert (tmp_path / "mine.pdf").read_bytes() == b"mine"
 
 
-def test_a_plan_asks_for_the_formats_beside_every_report(tmp_path):
-    plan = Plan.load("mouse").with_settings(['report.figures=["svg", "pdf", "pages"]'])
-    asked = write(tmp_path / "asked.liex", MOUSE, plan_toml=plan.to_toml())
-    made = sets.for_the_page(asked, tmp_path / "asked")
+def test_a_plan_asks_for_the_formats_beside_every_report(session, own, tmp_path):
+    own.metadata["plan"]["report"] = {"figures": ["svg", "pdf"]}
+    made = sets.for_the_page(own, tmp_path / "asked")
     drawn = {path.name for path in (tmp_path / "asked").iterdir()}
-    assert drawn == {"figures.pdf"} | {f"{one}.{kind}" for one in made for kind in ("svg", "pdf")}
-    usual = write(tmp_path / "usual.liex", MOUSE, plan_toml=Plan.load("mouse").to_toml())
-    sets.for_the_page(usual, tmp_path / "usual")
-    usually = {path.name for path in (tmp_path / "usual").iterdir()}
+    assert drawn == {f"{one}.{kind}" for one in made for kind in ("svg", "pdf")}
+    usually = {path.name for path in (session.path / "figures").iterdir()}
     assert usually == {"figures.pdf"} | {f"{one}.svg" for one in made}
 
 
@@ -281,7 +266,7 @@ def test_every_name_of_the_transitions_is_on_the_paper():
         own = words[first:] + words[:first]
         one: Any = SimpleNamespace(who="m01", words=own, table=lambda name: table)
         with drawing():
-            figure = actions.transitions(one)
+            figure = times.transitions(one)
             assert figure is not None
             FigureCanvasAgg(figure).draw()
         for text in figure.findobj(Text):
@@ -296,18 +281,6 @@ def test_every_figure_has_something_to_show_of_a_usual_session(session, tmp_path
     assert {path.stem for path in found["files"]} == set(sets.OF_SESSION) - {"onsets"}
 
 
-def test_texts_stay_texts_that_can_be_edited(session, tmp_path):
-    draw_figures(session.path, only=["occupancy"], out=tmp_path)
-    svg = (tmp_path / "occupancy.svg").read_text(encoding="utf-8")
-    assert "Occupancy, circle" in svg
-    assert ">nest &lt;1&gt;</text>" in svg
-    assert 'width="252.' in svg  # 89 mm in points
-    assert "Date" not in svg
-    pdf = (tmp_path / "occupancy.pdf").read_bytes()
-    assert b"/Type3" not in pdf
-    assert b"CreationDate" not in pdf
-
-
 def test_a_link_in_the_place_of_a_figure_is_not_written_through(session, tmp_path):
     theirs = tmp_path / "theirs"
     theirs.mkdir()
@@ -317,11 +290,9 @@ def test_a_link_in_the_place_of_a_figure_is_not_written_through(session, tmp_pat
     assert not list(theirs.iterdir())
 
 
-def test_a_dollar_in_a_name_is_a_dollar(tmp_path):
-    mouse = write(tmp_path / "d.liex", MOUSE, name="a$b$ <c>")
-    (one,) = animals(mouse)
+def test_a_dollar_in_a_name_is_a_dollar(animal):
     with drawing():
-        svg = image_bytes(times.ethogram(one), "svg")
+        svg = image_bytes(times.ethogram(replace(animal, subject="a$b$ <c>")), "svg")
     assert "a$b$ &lt;c&gt;" in svg.decode()
     assert "a$b$ &lt;c&gt;" in on_page(svg, "x", "y <z>")
     assert 'aria-label="y &lt;z&gt;"' in on_page(svg, "x", "y <z>")
@@ -356,11 +327,11 @@ def test_of_several_animals_each_has_its_figures(session):
     moved = pd.concat([moved, moved.assign(individual="mouse_2", x_mm=np.nan, y_mm=np.nan)])
     both = Session(session.path, session.metadata)
     both.__dict__.update(frames=frames, kinematics=moved)
-    first = Seen(both, "mouse_1", alone=False)
-    second = Seen(both, "mouse_2", alone=False)
-    assert places.occupancy_of(first).n == 268
+    first = SessionAnimal(both, "mouse_1", alone=False)
+    second = SessionAnimal(both, "mouse_2", alone=False)
+    assert places.occupancy_of(first).n == 172
     assert places.occupancy_of(second).n == 0
-    assert "circle, mouse_1" in text_of(places.occupancy_map(first))
+    assert "walker, mouse_1" in text_of(places.occupancy_map(first))
 
 
 @pytest.fixture(scope="module")
@@ -369,7 +340,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("study")
     for group, speed in (("control", 150.0), ("drug", 250.0)):
         for k in range(3):
-            mouse = WalkingMouse(steady(4.0), speed_mm_s=speed + 10.0 * k, rear_s=(1.0, 2.0))
+            mouse = WalkingMouse(steady(2.0), speed_mm_s=speed + 10.0 * k, rear_s=(0.5, 1.2))
             name = f"{group}{k}"
             facts = {"subject_id": name, "group": group}
             write(folder / f"{name}.liex", mouse, name=name, subject=facts, arena=BOWL)
@@ -377,12 +348,15 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_comparison_draws_every_animal_and_the_interval_of_the_table(study, tmp_path):
-    found = compare_groups([study], tmp_path / "cmp", ["mean_speed_mm_s", "rear_count"])
+def test_a_comparison_draws_every_animal_and_figures_no_longer_compared_are_removed(
+    study, tmp_path
+):
+    place = tmp_path / "cmp"
+    found = compare_groups([study], place, ["mean_speed_mm_s", "rear_count"])
     names = {path.name for path in found["figures"]}
     assert {"compare_mean_speed_mm_s.svg", "compare_mean_speed_mm_s.pdf", "effects.svg"} <= names
     assert {"occupancy_groups.svg", "occupancy_subjects.svg", "distances.svg"} <= names
-    table, stats, sessions = sets.read_comparison(tmp_path / "cmp")
+    table, stats, sessions = sets.read_comparison(place)
     assert len(sessions) == 6
     with drawing():
         figure = groups.comparison(
@@ -403,6 +377,12 @@ def test_a_comparison_draws_every_animal_and_the_interval_of_the_table(study, tm
     assert "mean speed, cm/s" in said
     assert "6 sessions in the study, 6 compared" in said
     assert f"g {row['effect_size']:.2f}" in said
+    own = place / "figures" / "compare_with_last_year.txt"
+    own.write_text("a user's")
+    compare_groups([study], place, ["rear_count"])
+    draw_figures(place, only=["rear_count"], formats=["png"])
+    names = {path.name for path in (place / "figures").glob("compare_*")}
+    assert names == {own.name, *(f"compare_rear_count.{kind}" for kind in ("svg", "pdf", "png"))}
 
 
 def test_sessions_of_one_name_stay_in_their_own_groups(tmp_path):
@@ -420,34 +400,15 @@ def test_sessions_of_one_name_stay_in_their_own_groups(tmp_path):
 
 def test_the_mean_of_a_group_counts_every_subject_alike(study):
     sessions = [Session.open(path) for path in sorted(study.glob("*.liex"))]
-    seen = [one for session in sessions for one in animals(session)]
-    both = groups.by_group(seen)
+    animal = [one for session in sessions for one in session_animals(session)]
+    both = groups.by_group(animal)
     assert {name: len(subjects) for name, subjects in both.items()} == {"control": 3, "drug": 3}
-    text = text_of(groups.occupancy_by_group(seen))
+    text = text_of(groups.occupancy_by_group(animal))
     assert "control, n = 3 subjects" in text
     each = np.mean(
         [places.occupancy_of(one).observed_s for one in both["control"].values() for one in one]
     )
     assert f"mean of {each:.1f} s each" in text
-
-
-@pytest.mark.slow
-def test_figures_of_measures_that_are_compared_no_longer_are_removed_and_no_other_file(
-    study, tmp_path
-):
-    place = tmp_path / "cmp"
-    compare_groups([study], place, ["mean_speed_mm_s", "rear_count"])
-    own = place / "figures" / "compare_with_last_year.txt"
-    own.write_text("a user's")
-    draw_figures(place, only=["effects"], formats=["png"])
-    compare_groups([study], place, ["rear_count"])
-    names = {path.name for path in (place / "figures").glob("compare_*")}
-    assert names == {own.name, "compare_rear_count.svg", "compare_rear_count.pdf"}
-    draw_figures(place, formats=["png"])
-    assert {path.name for path in (place / "figures").glob("compare_*")} == {
-        *names,
-        "compare_rear_count.png",
-    }
 
 
 def test_a_study_has_its_figures(study, tmp_path):
@@ -476,16 +437,3 @@ def test_a_refused_test_is_drawn_hollow(study):
         figure = groups.comparison(table, stats, "speed", "")
     assert figure is not None
     assert "no test" in text_of(figure)
-
-
-def test_near_is_light_and_unread_is_grey():
-    depth = np.array([[700, 700, 700, 700], [700, 650, 650, 0]], np.uint16)
-    rgb = shade(depth, 80.0).astype(int)
-    assert rgb[1, 1].sum() > rgb[0, 0].sum()
-    assert rgb[1, 3].tolist() == [90, 90, 90]
-
-
-def test_a_skeleton_is_drawn_on_its_pixels():
-    rgb = np.full((20, 20, 3), 70, np.uint8)
-    svg = picture(rgb, np.array([[104.0, 55.0], [110.0, 60.0]]), [(0, 1)], left=100, top=50)
-    assert 'x1="4.5" y1="5.5" x2="10.5" y2="10.5"' in svg

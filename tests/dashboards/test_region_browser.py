@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
+from liex_lab.cli.options import region_setting
 from liex_lab.plan import Plan
-from liex_lab.scene.floor import Floor
-from liex_lab.scene.scene import Arena, Fixture, Scene
-from tests.conftest import REPOSITORY
-from tests.dashboards.conftest import Watched
+from liex_lab.sessions import Session
+from tests.dashboards.conftest import KEY, Watched
 from tests.dashboards.served import Served
-from tests.sessions.walking_mouse import FLOOR_MM, SMALL, WalkingMouse, steady, write
+from tests.sessions.walking_mouse import SMALL
 
-KEY = "walker"
 CORNERS = [(12.0, 10.0), (92.0, 8.0), (95.0, 70.0), (9.0, 66.0)]
-LEVEL = Floor.from_plane(np.array([0.0, 0.0, 1.0]), FLOOR_MM, SMALL)
-HOUSE = Scene(LEVEL, fixtures=(Fixture((120.0, -40.0), 62.0, 9000.0),))
 
 
 @pytest.fixture
-def served(tmp_path: Path) -> Served:
-    plan = Plan.load("mouse").to_toml()
-    write(
-        tmp_path / "study" / f"{KEY}.liex",
-        WalkingMouse(steady(2.0)),
-        name=KEY,
-        arena=Arena("round", (0, 0), 220.0),
-        scene=HOUSE,
-        plan_toml=plan,
-    )
-    return Served(tmp_path / "study")
+def served(own: Session) -> Served:
+    return Served(own.path.parent)
 
 
 def opened(served: Served, page: Page) -> None:
@@ -63,13 +46,31 @@ def corners(page: Page) -> list[list[float]]:
     return [[float(value) for value in one.split(",")] for one in text.split()]
 
 
-def test_a_polygon_is_clicked_dragged_undone_closed_and_saved_as_a_run_takes_it(
+def test_a_region_is_drawn_by_clicks_and_keys_over_the_scene_and_saved_as_a_run_takes_it(
     served: Served, watched: Watched
 ) -> None:
     page = watched.page
-    opened(served, page)
+    page.goto(f"{served.address}/session/{KEY}")
+    scene = page.locator("img.scene")
+    scene.scroll_into_view_if_needed()
+    expect(scene).to_have_js_property("naturalWidth", SMALL.width)
+    drawn_scene = page.request.get(f"{served.address}/region/{KEY}/scene.svg").text()
+    assert "62 mm" in drawn_scene
+    assert 'class="outline"' in drawn_scene
+    page.get_by_role("link", name="Draw the region of the arena").click()
+    page.wait_for_selector("#region.is-open .scene-line")
+    page.locator(".region-stage").scroll_into_view_if_needed()
     save = page.get_by_role("button", name="Save into the plan")
     expect(save).to_be_disabled()
+    drawn_by_keys(page)
+    page.locator("#region-corners").fill("10,10 90,60 90,10 10,60")
+    save.focus()
+    save.click()
+    expect(page.locator(".region-said.is-wrong")).to_contain_text("sides 1 and 3 of its polygon")
+    assert_saved_by_nobody_else(served, page)
+    assert len(watched.complaints) == 1  # the browser's own, of an answer 400
+    watched.complaints.clear()
+    page.get_by_role("button", name="Clear").click()
     for corner in CORNERS:
         click(page, *corner)
     np.testing.assert_allclose(corners(page), CORNERS, atol=0.3)
@@ -98,76 +99,30 @@ def test_a_polygon_is_clicked_dragged_undone_closed_and_saved_as_a_run_takes_it(
     assert line.endswith(f"--region '{told}'")
     opened(served, page)  # what the plan states is there again
     assert corners(page) == region.polygon
+    taken = Plan.load("mouse").with_settings(region_setting(line.split("'")[1])).arena.region
+    assert taken is not None
+    assert taken.polygon == region.polygon  # liex doctor takes what the page says
     watched.nothing_went_wrong()
 
 
-def test_a_region_is_drawn_by_keys_alone_and_a_crossing_one_is_refused(
-    served: Served, watched: Watched
-) -> None:
-    page = watched.page
-    opened(served, page)
+def drawn_by_keys(page: Page) -> None:
     page.locator(".region-stage").focus()
     for keys in (["Shift+ArrowLeft"] * 3, ["Shift+ArrowRight"] * 6, ["Shift+ArrowDown"] * 2):
-        for key in keys:
+        for key in (*keys, "Enter"):
             page.keyboard.press(key)
-        page.keyboard.press("Enter")
     page.keyboard.press("c")
     assert corners(page) == [[23.0, 40.0], [83.0, 40.0], [83.0, 60.0]]
     page.keyboard.press("n")
     page.keyboard.press("ArrowUp")
     assert corners(page)[0] == [23.0, 39.0]
-    page.locator("#region-corners").fill("10,10 90,60 90,10 10,60")
-    page.get_by_role("button", name="Save into the plan").focus()
-    page.get_by_role("button", name="Save into the plan").click()
-    expect(page.locator(".region-said.is-wrong")).to_contain_text("sides 1 and 3 of its polygon")
-    assert not (served.study / "walker.plan.toml").exists()
-    assert len(watched.complaints) == 1  # the browser's own, of an answer 400
 
 
-def test_the_scene_is_drawn_over_the_picture_of_a_session(served: Served, watched: Watched) -> None:
-    page = watched.page
-    page.goto(f"{served.address}/session/{KEY}")
-    scene = page.locator("img.scene")
-    scene.scroll_into_view_if_needed()
-    expect(scene).to_have_js_property("naturalWidth", SMALL.width)
-    drawn = page.request.get(f"{served.address}/region/{KEY}/scene.svg").text()
-    assert "62 mm" in drawn
-    assert 'class="outline"' in drawn
-    assert 'class="fixture"' in drawn
-    page.get_by_role("link", name="Draw the region of the arena").click()
-    page.wait_for_selector("#region.is-open .scene-line")
-    watched.nothing_went_wrong()
-
-
-def test_a_region_is_saved_by_nobody_without_the_token_and_by_no_form_of_another_site(
-    served: Served, watched: Watched
-) -> None:
+def assert_saved_by_nobody_else(served: Served, page: Page) -> None:
+    """Neither without the page's own request nor by a form of another site."""
     address = f"{served.address}/region/{KEY}/save"
-    form = watched.page.request.post(address, form={"place": "beside"})
+    form = page.request.post(address, form={"place": "beside"})
     assert (form.status, form.json()["said"]) == (400, "no region is saved here")
     asked = {"place": "beside", "corners": CORNERS, "was": None}
     foreign = {"Origin": "http://elsewhere.example"}
-    assert watched.page.request.post(address, data=asked, headers=foreign).status == 403
+    assert page.request.post(address, data=asked, headers=foreign).status == 403
     assert not (served.study / "walker.plan.toml").exists()
-
-
-def test_the_doctor_takes_what_the_page_says(served: Served, watched: Watched) -> None:
-    page = watched.page
-    opened(served, page)
-    page.locator("#region-corners").fill("20,20 300,20 300,220 20,220")
-    page.locator("#region-corners").blur()
-    line = page.locator("#region-command").inner_text()
-    assert line == "liex doctor RECORDING --region '20,20 300,20 300,220 20,220'"
-    command = [
-        sys.executable,
-        "-m",
-        "liex_lab",
-        "doctor",
-        "synthetic:walk?frames=60&sensor=primesense-qvga",
-    ]
-    corners = line.split("'")[1]
-    ran = subprocess.run(
-        [*command, "--region", corners], cwd=REPOSITORY, capture_output=True, text=True
-    )
-    assert "only a region is inspected" in ran.stdout, ran.stdout + ran.stderr
-    watched.nothing_went_wrong()

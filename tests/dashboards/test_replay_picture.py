@@ -52,9 +52,12 @@ def drivers() -> bool:
     )
 
 
-pytestmark = pytest.mark.skipif(
-    not drivers(), reason="needs Vulkan: apt install libvulkan1 mesa-vulkan-drivers"
-)
+pytestmark = [
+    pytest.mark.nightly,
+    pytest.mark.skipif(
+        not drivers(), reason="needs Vulkan: apt install libvulkan1 mesa-vulkan-drivers"
+    ),
+]
 
 
 @pytest.fixture(scope="module")

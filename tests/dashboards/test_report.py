@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import re
 import tarfile
-from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.dashboards.report.facts import beside_average
-from liex_lab.dashboards.report.quality import flip_rows, frame_account, warnings
-from liex_lab.dashboards.report.report import methods, render, write_report
+from liex_lab.dashboards.report.facts import beside_average, frame_account, methods, warnings
+from liex_lab.dashboards.report.report import render, write_report
 
 from liex_lab.actions import vocabulary
 from liex_lab.behaviour import measure_session
@@ -21,39 +20,25 @@ from liex_lab.behaviour.activity import around_onsets
 from liex_lab.body import Skeleton
 from liex_lab.exchange import export
 from liex_lab.optics.refraction import Water
-from liex_lab.recordings.timestamps import find_gaps, median_step
-from liex_lab.scene.scene import Arena
-from liex_lab.scene.zones import Zone
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions.rrd import PALETTE
 from liex_lab.sessions.verdict import Verdict
-from liex_lab.tables import schema
 from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
-MOUSE = WalkingMouse(np.delete(steady(4.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(60, 61))
+
+@pytest.fixture(scope="module")
+def session(walker: Session) -> Session:
+    return Session.open(walker.path)
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory) -> Session:
-    return write(
-        tmp_path_factory.mktemp("report") / "circle.liex",
-        MOUSE,
-        report=write_report,
-        problems=["Dark & <cold>."],
-        gaps=find_gaps(MOUSE.times_ns, median_step(MOUSE.times_ns)),
-        model={"name": "mouse", "sha256": "ab" * 32},
-    )
+def page(walker: Session) -> str:
+    return (walker.path / "report.html").read_text(encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def page(session) -> str:
-    return (session.path / "report.html").read_text(encoding="utf-8")
-
-
-def test_the_report_is_written_with_the_session_and_can_be_made_again(session, page):
-    assert render(session) == page
-    assert write_report(session.path).read_text(encoding="utf-8") == page
+def test_the_report_is_written_with_the_session_and_can_be_made_again(own, page):
+    assert write_report(own.path).read_text(encoding="utf-8") == page
 
 
 def test_the_report_asks_for_nothing_from_outside(page):
@@ -99,9 +84,9 @@ def test_the_numbers_of_the_summary_are_on_the_page(session, page):
     row = session.summary.iloc[0]
     assert f"{row['distance_m']:.2f}" in page
     for name in session.summary.columns[2:]:
-        assert name in page, name
+        assert escape(name) in page, name
     for column in session.columns["name"]:
-        assert column in page, column
+        assert escape(column) in page, column
 
 
 def test_text_from_the_recording_cannot_become_markup(page):
@@ -109,28 +94,21 @@ def test_text_from_the_recording_cannot_become_markup(page):
     assert "<cold>" not in page
 
 
-def test_warnings_come_before_everything_else_and_say_what_is_wrong(session, page):
-    sentences = warnings(session)
-    assert sentences[0] == "Dark & <cold>."
-    assert any("did not deliver 6 frames, in 1 gap;" in sentence for sentence in sentences)
+def test_warnings_come_before_everything_else_and_every_frame_is_accounted_for(session, page):
     assert page.index("Read this first") < page.index('class="cards"')
-    shares = [share for _, share, _, _ in frame_account(session)]
-    assert sum(shares) == pytest.approx(1.0)
+    assert "did not deliver 6 frames, in 1 gap;" in page
+    assert sum(share for _, share, _, _ in frame_account(session)) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("caution", ["", "2 animals are in view and one of them is followed"])
-def test_a_report_with_something_to_say_does_not_say_that_there_is_nothing(
-    session, monkeypatch, caution
-):
+def test_a_report_with_something_to_say_does_not_say_that_there_is_nothing(session, monkeypatch):
     monkeypatch.setattr("liex_lab.dashboards.report.report.warnings", lambda _: [])
-    verdict = Verdict(9, 9, 9, 9, 2.0, 1, (), (caution,) if caution else ())
-    monkeypatch.setitem(session.metadata, "verdict", verdict.to_dict())
-    page = render(session)
-    assert ("Nothing to warn of" in page) == (not caution)
-    assert caution in page
-
-
-def test_a_warning_is_a_sentence_and_the_list_that_it_names_is_below(session, monkeypatch):
+    monkeypatch.setattr("liex_lab.dashboards.report.report.for_the_page", lambda *_: {})
+    for caution in ("", "2 animals are in view and one of them is followed"):
+        verdict = Verdict(9, 9, 9, 9, 2.0, 1, (), (caution,) if caution else ())
+        monkeypatch.setitem(session.metadata, "verdict", verdict.to_dict())
+        page = render(session)
+        assert ("Nothing to warn of" in page) == (not caution)
+        assert caution in page
     told = ["the clock jumps", "depth_ts.txt has 3 rows too many.", "is it so?"]
     told += ["2 bouts were left unlabelled (refused_bouts in session.json)."]
     monkeypatch.setattr("liex_lab.dashboards.report.report.warnings", lambda _: told)
@@ -143,52 +121,37 @@ def test_a_warning_is_a_sentence_and_the_list_that_it_names_is_below(session, mo
     ]
 
 
-def test_exchanges_of_head_and_tail_are_warned_of_and_listed(session, monkeypatch):
-    flips = schema.to_pandas(
-        schema.FLIPS,
-        {
-            "session_id": "circle",
-            "individual": "mouse_1",
-            "start_s": [1.0, 2.0],
-            "stop_s": [1.5, 2.25],
-            "start_frame": [30, 60],
-            "stop_frame": [45, 68],
-            "p_flip": [0.9, 0.4],
-            "applied": [True, False],
-            "source": ["model", "model"],
-            "undone_at": ["", ""],
-        },
-    )
+def test_each_warning_is_a_sentence_of_the_numbers_behind_it(session):
     again = Session.open(session.path)
-    monkeypatch.setattr(type(again), "flips", flips)
-    assert any(
-        "2 stretches of 0.8 s in all; 1 was put right" in sentence for sentence in warnings(again)
+    frames = dict(again.metadata["frames"], n_observed=100)
+    frames["flags"] = {"doubtful": 30, "hidden": 1, "not_found": 73}
+    again.metadata.update(frames=frames, verdict={"n_animals": 3}, schema_version=7)
+    flips = [(1.0, 1.5, 0.9, True), (2.0, 2.25, 0.4, False)]
+    exchanged = pd.DataFrame(flips, columns=["start_s", "stop_s", "p_flip", "applied"])
+    bouts = again.bouts.assign(contradicts="")
+    bouts.loc[0, "contradicts"] = "too slow"
+    again.__dict__.update(flips=exchanged.assign(source="model", undone_at=""), bouts=bouts)
+    parts = (
+        "Dark & <cold>.",
+        "nothing is measured of the others. Record one animal at a time, or check in the replay",
+        "The camera did not deliver 6 frames, in 1 gap; no speed or distance is measured across",
+        "The animal is behind or under something in 1 frame (0.6% of 174), which have no pose; the",
+        "73 frames have no pose (42.0% of 174); times and shares are of the rest.",
+        "30 frames are doubtful (17.2% of 174): the predicted error is large, or the depth image",
+        "Head and tail may have been exchanged in 2 stretches of 0.8 s in all; 1 was corrected.",
+        "An earlier version of liex_lab wrote this session and counted lost frames in the time of",
+        "1 bout contradicts the definition of the name, which was left as it is; see the list",
     )
-    assert flip_rows(again) == [
-        ("1.00", "1.50", "0.90", "put right"),
-        ("2.00", "2.25", "0.40", "left as it was"),
-    ]
-    assert "Head and tail perhaps exchanged" in render(again)
+    for sentence, part in zip(warnings(again), parts, strict=True):
+        assert part in sentence
 
 
-def test_noise_that_hides_a_pause_is_warned_of(tmp_path):
-    assert not any(
-        "not to be trusted" in sentence for sentence in warnings(write(tmp_path / "a.liex", MOUSE))
-    )
-    track = replace(MOUSE, sd_mm=8.0)
-    assert any(
-        "not to be trusted" in sentence for sentence in warnings(write(tmp_path / "b.liex", track))
-    )
-
-
-def test_the_matrix_and_the_zones_are_on_the_page(tmp_path):
-    nest = Zone("nest <1>", polygon_mm=((0.0, 0.0), (250.0, 0.0), (250.0, 250.0), (0.0, 250.0)))
-    page = render(
-        write(tmp_path / "z.liex", WalkingMouse(steady(12.0), rear_s=(2.0, 3.0)), zones=(nest,))
-    )
-    assert "nest &lt;1&gt;" in page
-    assert "nest <1>" not in page
-    assert re.search(r"Transitions, circle, n = 2 transitions", page)
+def test_noise_that_hides_a_pause_is_warned_of(tmp_path, session):
+    noisy = write(tmp_path / "b.liex", WalkingMouse(steady(2.0), sd_mm=8.0))
+    assert [
+        any("not to be trusted" in sentence for sentence in warnings(one))
+        for one in (session, noisy)
+    ] == [False, True]
 
 
 def test_a_measure_around_an_onset_is_what_the_frames_say():
@@ -210,7 +173,7 @@ def test_a_measure_around_an_onset_is_what_the_frames_say():
 def test_a_fish_has_a_report_of_its_own(tmp_path):
     """Its curves are the tail's, and what a slow camera cannot measure is said."""
     session = write(
-        tmp_path / "fish.liex", WalkingMouse(steady(3.0), skeleton=Skeleton.load("fish"))
+        tmp_path / "fish.liex", WalkingMouse(steady(2.0), skeleton=Skeleton.load("fish"))
     )
     page = render(session)
     assert "Tail beat" in page
@@ -219,67 +182,58 @@ def test_a_fish_has_a_report_of_its_own(tmp_path):
     assert "first_bend_s" in page
 
 
-def test_the_methods_state_what_was_done(session):
+def test_walls_zones_transitions_and_the_methods_are_on_the_page(session, page):
+    for said in (
+        "round, radius 220 mm; zones: nest &lt;1&gt;",
+        "Transitions, walker, n = 2 transitions",
+        ">nest &lt;1&gt;</text>",
+    ):
+        assert said in page, said
+    assert "nest <1>" not in page
     text = " ".join(methods(session))
     for said in (
         "liex_lab",
         "model mouse",
         "abababab",
-        "112 of 114",
+        "172 of 174",
         "6 further frames",
-        "40 mm",
         "0.33 s",
     ):
         assert said in text, said
 
 
-def test_walls_zones_and_what_was_undone_are_shown(tmp_path):
+def test_the_corrected_optics_are_stated(session):
     water = Water(450.0, 1.333, ranging="light_field")
     bent = {"model": "kannala_brandt", "coefficients": [0.125, 0.0, 0.0, 0.0]}
-    optics = {"distortion": bent, "water": water.to_dict()}
-    bowl = Arena("round", (0.0, 0.0), 250.0, None, None, 0.5, 1.0, "wall")
-    nest = Zone("nest", polygon_mm=((0.0, 0.0), (50.0, 0.0), (50.0, 50.0)))
-    session = write(tmp_path / "c.liex", MOUSE, optics=optics, arena=bowl, zones=(nest,))
-    page = render(session)
-    for said in (
-        "round, radius 250 mm; zones: nest",
-        "kannala_brandt 0.125",
-        "450 mm below the lens",
-        ">nest</text>",
-    ):
-        assert said in page, said
-    assert "ideal camera in air" in " ".join(methods(session))
+    again = Session.open(session.path)
+    again.metadata["camera"]["optics"] = {"distortion": bent, "water": water.to_dict()}
+    text = " ".join(methods(again))
+    for said in ("kannala_brandt 0.125", "450 mm below the lens", "ideal camera in air"):
+        assert said in text, said
 
 
 @pytest.mark.parametrize(
     "archive", sorted((REPOSITORY / "tests" / "golden").glob("*.tar.gz")), ids=lambda a: a.stem
 )
-def test_a_session_of_an_older_version_can_be_reported_measured_and_exported(tmp_path, archive):
+def test_a_session_of_an_older_version_can_be_measured_and_exported(tmp_path, archive):
     with tarfile.open(archive) as packed:
         packed.extractall(tmp_path, filter="data")
     (found,) = tmp_path.rglob("session.json")
-    assert "How good it is" in render(Session.open(found.parent))
     assert len(measure_session(Session.open(found.parent)).summary) == 1
     for target in ("csv", "boris", "dlc", "movement", "sleap"):
         assert export(Session.open(found.parent), target, tmp_path).exists()
 
 
-def test_a_session_without_behaviour_has_a_report_too(tmp_path):
-    with SessionWriter(tmp_path / "bare.liex", MOUSE.provenance(), report=write_report) as writer:
-        for frames, _ in MOUSE.chunks(20):
+def test_a_session_without_behaviour_or_without_any_pose_has_a_report_too(tmp_path):
+    mouse = WalkingMouse(steady(1.0), lost=tuple(range(30)))
+    with SessionWriter(tmp_path / "bare.liex", mouse.provenance(), report=write_report) as writer:
+        for frames, _ in mouse.chunks(20):
             writer.add(frames)
-        writer.track = MOUSE.track()
+        writer.track = mouse.track()
         session = writer.close()
     assert "Over time" in (session.path / "report.html").read_text()
-
-
-def test_a_session_without_any_pose_has_a_report_too(tmp_path):
-    session = write(
-        tmp_path / "lost.liex",
-        WalkingMouse(steady(1.0), lost=tuple(range(30))),
-        report=write_report,
-    )
-    assert "0.0%" in (session.path / "report.html").read_text()
+    lost = write(tmp_path / "lost.liex", mouse)
+    assert "0.0%" in render(lost)
 
 
 def test_the_replay_and_the_report_give_an_action_the_same_colour(session, page):

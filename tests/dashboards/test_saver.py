@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from liex_lab.dashboards.app.saver import FAILED, SAVED, Saver
+from liex_lab.dashboards.app.corrections import FAILED, SAVED, Saver
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions.corrections import Correction, JointMove, Log, corrected_folder, read_log

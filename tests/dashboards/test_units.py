@@ -10,8 +10,7 @@ from liex_lab.dashboards.units import counted, day, reading, shown, titled
 
 
 def test_speeds_and_angles_are_shown_in_cm_s_and_degrees() -> None:
-    value, unit = shown(120.0, "mm/s")
-    assert (value, unit) == (pytest.approx(12.0), "cm/s")
+    assert shown(120.0, "mm/s") == (pytest.approx(12.0), "cm/s")
     angles, unit = shown(np.array([np.pi, -np.pi / 2]), "rad")
     assert unit == "°"
     np.testing.assert_allclose(angles, [180.0, -90.0])
@@ -19,40 +18,37 @@ def test_speeds_and_angles_are_shown_in_cm_s_and_degrees() -> None:
     assert shown(62.9, "mm") == (62.9, "mm")
 
 
-def test_a_column_is_titled_without_its_unit() -> None:
-    assert titled("mean_speed_mm_s", "mm/s") == "mean speed"
-    assert titled("mean_abs_yaw_rate_rad_s", "rad/s") == "mean abs yaw rate"
-    assert titled("n_lost", "") == "n lost"
-    assert titled("distance_m", "m") == "distance"
+NAN = float("nan")
 
 
-def test_one_thing_is_not_several() -> None:
-    assert counted(1, "stretch", "stretches") == "1 stretch"
-    assert counted(2, "stretch", "stretches") == "2 stretches"
-    assert counted(1200, "frame") == "1,200 frames"
-    assert counted(0, "gap") == "0 gaps"
-
-
-def test_numbers_of_a_unit_have_as_many_decimals_but_never_fewer_than_two_digits() -> None:
-    assert [reading(value, "s") for value in (0.7505, 1.6, 12.0)] == ["0.75", "1.60", "12.00"]
-    assert reading(9.076, "cm/s") == "9.1"
-    assert reading(0.02134, "m") == "0.021"
-    assert reading(1234.56, "mm") == "1,234.6"
-    assert reading(0.0, "mm") == "0.0"
-    assert reading(np.nan, "s") == "–"
-
-
-def test_counts_are_whole_whatever_they_were_read_as() -> None:
-    assert reading(np.int64(1200), "") == "1,200"
-    assert reading(3.0, "") == "3"
-    assert reading(-0.4462, "") == "-0.45"
-
-
-def test_a_day_is_written_as_people_write_it() -> None:
-    told = "25 January 2017, 10:42:07 (UTC-05:00)"
-    assert day("2017-01-25T10:42:07.173469-05:00") == told
-    assert day("2026-08-01T09:00:00") == "1 August 2026, 09:00:00"
-    assert day("some day") == "some day"
+@pytest.mark.parametrize(
+    ("made", "text"),
+    [
+        (titled("mean_speed_mm_s", "mm/s"), "mean speed"),  # a column without its unit
+        (titled("mean_abs_yaw_rate_rad_s", "rad/s"), "mean abs yaw rate"),
+        (titled("n_lost", ""), "n lost"),
+        (titled("distance_m", "m"), "distance"),
+        (counted(1, "stretch", "stretches"), "1 stretch"),  # one object is not several
+        (counted(2, "stretch", "stretches"), "2 stretches"),
+        (counted(1200, "frame"), "1,200 frames"),
+        (counted(0, "gap"), "0 gaps"),
+        (reading(0.7505, "s"), "0.75"),  # decimals of the unit, but never fewer than two digits
+        (reading(12.0, "s"), "12.00"),
+        (reading(9.076, "cm/s"), "9.1"),
+        (reading(0.02134, "m"), "0.021"),
+        (reading(1234.56, "mm"), "1,234.6"),
+        (reading(0.0, "mm"), "0.0"),
+        (reading(NAN, "s"), "–"),
+        (reading(np.int64(1200), ""), "1,200"),  # counts are whole, whatever they were read as
+        (reading(3.0, ""), "3"),
+        (reading(-0.4462, ""), "-0.45"),
+        (day("2017-01-25T10:42:07.173469-05:00"), "25 January 2017, 10:42:07 (UTC-05:00)"),
+        (day("2026-08-01T09:00:00"), "1 August 2026, 09:00:00"),
+        (day("some day"), "some day"),
+    ],
+)
+def test_numbers_names_and_days_are_written_as_people_write_them(made: str, text: str) -> None:
+    assert made == text
 
 
 def test_the_table_of_differences_has_the_unit_of_its_measure() -> None:

@@ -294,7 +294,7 @@ def test_the_colours_spread_over_the_floor_and_an_animal_on_it():
 
 def test_a_blueprint_travels_inside_and_both_layouts_lie_beside(tmp_path, strict):
     from liex_lab.dashboards.replay.layouts import replay_blueprint
-    from liex_lab.dashboards.report.views import write_views
+    from liex_lab.dashboards.report.report import write_views
     from mcap.reader import make_reader
     from rerun.chunk import RrdReader
 

@@ -87,7 +87,7 @@ class Region {
     const address = `${this.base}/picture.png?of=${of}`;
     this.image.addEventListener("error", async () => {  // the reason, in words
       const answer = await fetch(address);
-      if (!answer.ok) this.say(await answer.text(), true);
+      if (!answer.ok) this.say((await answer.json()).said, true);
     }, { once: true });
     this.image.setAttribute("href", address);
   }

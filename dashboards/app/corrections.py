@@ -1,0 +1,381 @@
+"""Corrections from the pages: checked at once, saved in batches by one thread.
+
+All corrections of a session together determine its tables, so the corrections waiting for one
+session are applied in one batch. The report takes longer; it is made again after a while without
+corrections. A page polls the state of its corrections.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flask import Response, request
+
+from liex_lab.errors import LiexError, SessionError, one_line
+from liex_lab.sessions import correcting
+from liex_lab.sessions.corrections import Correction, read_log
+
+from ..figures.animals import Array
+from .desk import Desk, Desks, Stretch
+
+Correct = Callable[[Path, Sequence[Correction], Sequence[int], str], object]
+Report = Callable[[Path], object]
+
+WAITING = "waiting"
+SAVING = "saving"
+SAVED = "saved"
+FAILED = "failed"
+_CALM_S = 3.0  # time without a correction before the report is made again
+_KEPT_TICKETS = 1000
+_IMAGE_S = 3600  # browser cache time of an image; its address identifies the session
+
+
+@dataclass
+class Ticket:
+    """A queued correction, or the request to undo one.
+
+    Attributes:
+        folder: the session folder.
+        what: the correction; None undoes one.
+        author: the author of the request.
+        said: its effect, or why it failed.
+        undoes: number of the log entry to undo; 0 for a correction.
+        id: its number in the queue.
+        number: its own number in the log, once saved.
+        state: waiting, saving, saved or failed.
+    """
+
+    folder: Path
+    what: Correction | None
+    author: str
+    said: str
+    undoes: int = 0
+    id: int = 0
+    number: int = 0
+    state: str = WAITING
+
+
+class Saver:
+    """Saves corrections in the order in which they are requested.
+
+    Thread-safe.
+
+    Args:
+        correct: adds corrections to the session in a folder, or undoes some, with the author.
+        report: makes the report of the session in a folder again; None if `correct` does.
+        calm_s: time without corrections before a session's report is made again, s.
+    """
+
+    def __init__(
+        self, correct: Correct, report: Report | None = None, calm_s: float = _CALM_S
+    ) -> None:
+        self._correct = correct
+        self._report = report
+        self._calm_s = calm_s
+        self._changed = threading.Condition()
+        self._known: dict[int, Ticket] = {}
+        self._waiting: list[Ticket] = []
+        self._reports: dict[Path, float] = {}  # due times
+        self._reporting: Path | None = None
+        self._thread = threading.Thread(target=self._work, daemon=True)
+
+    def add(self, folder: Path, what: Correction, author: str) -> Ticket:
+        """Queue a correction by `author` of the session in `folder`."""
+        return self._put(Ticket(folder, what, author, str(what)))
+
+    def take_back(self, folder: Path, number: int, author: str) -> Ticket:
+        """Queue the undoing of the log entry `number`."""
+        return self._put(Ticket(folder, None, author, f"{number} is taken back", number))
+
+    def wait(self, ticket: Ticket) -> None:
+        """Wait until the correction of a ticket is saved.
+
+        Raises:
+            LiexError: it could not be saved.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: ticket.state in (SAVED, FAILED))
+        if ticket.state == FAILED:
+            raise LiexError(ticket.said)
+
+    def tickets(self, folder: Path) -> dict[int, Ticket]:
+        """The tickets of a session by their number, the latest last."""
+        with self._changed:
+            return {n: ticket for n, ticket in self._known.items() if ticket.folder == folder}
+
+    def busy(self, folder: Path) -> tuple[int, bool]:
+        """The number of unsaved corrections of a session, and whether its report is out of date."""
+        with self._changed:
+            unsaved = sum(ticket.folder == folder for ticket in self._waiting)
+            return unsaved, folder in (*self._reports, self._reporting)
+
+    def finish(self) -> None:
+        """Return when all corrections are saved and the reports are made."""
+        with self._changed:
+            while self._waiting or self._reports or self._reporting is not None:
+                self._reports = dict.fromkeys(self._reports, 0.0)
+                self._changed.notify_all()
+                self._changed.wait(0.1)
+
+    def _put(self, ticket: Ticket) -> Ticket:
+        with self._changed:
+            ticket.id = max(self._known, default=0) + 1
+            self._known[ticket.id] = ticket
+            if len(self._known) > _KEPT_TICKETS:
+                self._known.pop(min(self._known))
+            self._waiting.append(ticket)
+            if ticket.id == 1:
+                self._thread.start()
+            self._changed.notify_all()
+        return ticket
+
+    def _work(self) -> None:
+        """Save queued corrections for as long as the program runs."""
+        while True:
+            batch, report = self._next()
+            if batch:
+                self._save(batch)
+            elif report is not None and self._report is not None:
+                with suppress(LiexError, OSError):  # `liex report` shows the error
+                    self._report(report)
+                with self._changed:
+                    self._reporting = None
+                    self._changed.notify_all()
+
+    def _next(self) -> tuple[list[Ticket], Path | None]:
+        """The next task: corrections of one session by one person, or else a report."""
+        with self._changed:
+            while not self._waiting:
+                now = time.monotonic()
+                folder = min(self._reports, key=self._reports.__getitem__, default=None)
+                if folder is not None and self._reports[folder] <= now:
+                    self._reporting = folder
+                    del self._reports[folder]
+                    return [], folder
+                self._changed.wait(None if folder is None else self._reports[folder] - now + 0.01)
+            first, batch = self._waiting[0], list[Ticket]()
+            for ticket in self._waiting:
+                if (ticket.folder, ticket.author) != (first.folder, first.author):
+                    break
+                if ticket.what is None and any(one.what for one in batch):
+                    break  # a step of the log begins with its undos
+                ticket.state = SAVING
+                batch.append(ticket)
+            return batch, None
+
+    def _save(self, batch: list[Ticket]) -> None:
+        """Save a batch of corrections; one by one if the batch fails."""
+        folder = batch[0].folder
+        what = [ticket.what for ticket in batch if ticket.what is not None]
+        undo = [ticket.undoes for ticket in batch if ticket.what is None]
+        try:
+            self._correct(folder, what, undo, batch[0].author)
+            for entry in reversed(read_log(folder).entries):
+                for ticket in reversed(batch):
+                    made = (entry.what, entry.undoes) == (ticket.what, ticket.undoes)
+                    if made and not ticket.number:
+                        ticket.number = entry.number
+                        break
+        except Exception as error:  # the other corrections must still be saved
+            if len(batch) == 1:
+                reason = str(error) if isinstance(error, LiexError) else one_line(error)
+                self._settle(batch, FAILED, reason or type(error).__name__)
+            for ticket in batch if len(batch) > 1 else ():
+                self._save([ticket])
+        else:
+            self._settle(batch, SAVED)
+
+    def _settle(self, batch: list[Ticket], state: str, reason: str = "") -> None:
+        with self._changed:
+            for ticket in batch:
+                ticket.state = state
+                ticket.said = reason or ticket.said
+                self._waiting.remove(ticket)
+            if state == SAVED and self._report is not None:
+                self._reports[batch[0].folder] = time.monotonic() + self._calm_s
+            self._changed.notify_all()
+
+
+class Clerk:
+    """Answers the correction page: a session's data, and its corrections.
+
+    Args:
+        desks: the study's sessions.
+        saver: saves the corrections; None accepts none.
+    """
+
+    def __init__(self, desks: Desks, saver: Saver | None) -> None:
+        self._desks = desks
+        self._saver = saver
+
+    def about(self, key: str) -> dict[str, Any]:
+        """Facts about the session `key`; for a session without poses, the reason and no n."""
+        try:
+            return {**self._desks.of(key).about(), "may_correct": self._saver is not None}
+        except LiexError as error:
+            return {"said": str(error)}
+
+    def times(self, key: str) -> Response:
+        """The frame times of the session `key`, s; empty without poses."""
+        try:
+            return binary(self._desks.of(key).time_s)
+        except LiexError:  # the page shows the reason
+            return binary(np.zeros(0))
+
+    def doubts(self, key: str) -> list[Stretch]:
+        """The doubtful stretches of the session `key`: of poses, or with ?of=actions of actions."""
+        desk = self._desks.of(key)
+        return desk.suggested if request.args.get("of") == "actions" else desk.doubts()
+
+    def frame(self, key: str, row: int) -> Response:
+        """The part ?box=left,top,width,height of the frame in a `row` of the session `key`."""
+        return frame_part(self._desks.of(key), row, _IMAGE_S)
+
+    def state(self, key: str) -> dict[str, Any]:
+        """The state of a session's corrections: unsaved, report, tickets, and the log.
+
+        Raises:
+            SessionError: there is no such session.
+        """
+        if self._saver is None:
+            return {"unsaved": 0, "report_old": False, "tickets": {}, "log": []}
+        desk = self._desks.of(key)
+        unsaved, old = self._saver.busy(desk.session.path)
+        return {
+            "unsaved": unsaved,
+            "report_old": old,
+            "tickets": {
+                str(n): {"state": one.state, "said": one.said, "number": one.number}
+                for n, one in self._saver.tickets(desk.session.path).items()
+            },
+            "log": desk.log(),
+            "redo": desk.redo(),
+            "notes": desk.notes,
+        }
+
+    def correct(self, key: str) -> Any:
+        """Check a correction of the session `key` and queue it; returns its ticket and its effect.
+
+        The request is JSON with by, at_s (the displayed moment), and one of: sentence, optionally
+        with try; undo with a number or a ticket; redo. While a joint is dragged, its correction is
+        only checked (try) and not queued.
+
+        Raises:
+            LiexError: the request is invalid.
+        """
+        asked = request.get_json(silent=True)  # another site's form cannot send JSON
+        saver = self._saver
+        if saver is None or not isinstance(asked, dict):
+            return {"said": "no correction is taken here"}, 403 if saver is None else 400
+        desk = self._desks.of(key)
+        folder = desk.session.path
+        author = _text(asked, "by")
+        if asked.get("undo"):
+            ticket = saver.take_back(folder, _number_of(saver, folder, asked), author)
+        elif asked.get("redo"):
+            return _redo(saver, folder, author)
+        else:
+            what = correction_in(desk, _text(asked, "sentence"), _number(asked, "at_s"))
+            if asked.get("try"):
+                return {"ticket": None, "said": str(what), **vars(what)}
+            ticket = saver.add(folder, what, author)
+        return {"ticket": ticket.id, "said": ticket.said}
+
+
+def _number_of(saver: Saver, folder: Path, asked: dict[str, Any]) -> int:
+    """The log's number of the correction to undo, from that number or from its ticket."""
+    number = asked.get("number")
+    if "ticket" in asked:
+        ticket = saver.tickets(folder).get(int(_number(asked, "ticket")))
+        if ticket is None:
+            raise SessionError("that correction is not known here; take it back from the list")
+        saver.wait(ticket)
+        number = ticket.number
+    if not isinstance(number, int) or isinstance(number, bool):
+        raise SessionError(f"a correction is taken back by its number, got {number!r}")
+    return number
+
+
+def _redo(saver: Saver, folder: Path, author: str) -> dict[str, Any]:
+    """Repeat the last undone correction, once the queue is saved; returns its number."""
+    for ticket in [*saver.tickets(folder).values()][-1:]:
+        saver.wait(ticket)
+    log = read_log(folder)
+    if log.redoable is None:
+        raise SessionError("nothing was taken back since the last new correction")
+    number, what = log.redoable
+    ticket = saver.take_back(folder, number, author)
+    return {"ticket": ticket.id, "said": f"made again: {what}", "number": log.undos[number]}
+
+
+def correction_in(desk: Desk, sentence: str, at_s: float) -> Correction:
+    """The correction in a sentence, see `correcting.parse_correction`.
+
+    `flip` alone exchanges head and tail in the doubtful stretch at the moment, else in its frame.
+
+    Args:
+        desk: the session's current state.
+        sentence: the sentence.
+        at_s: the displayed moment, s since the first frame.
+
+    Raises:
+        LiexError: the correction is invalid.
+    """
+    if sentence != "flip":
+        return correcting.parse_correction(desk.session, sentence, at_s)
+    row = int(np.abs(desk.time_s - at_s).argmin())
+    start_s, stop_s = np.append(desk.time_s, desk.time_s[-1] + 1.0)[row : row + 2].tolist()
+    flips = desk.session.flips
+    here = flips[(flips["start_s"] <= at_s) & (at_s <= flips["stop_s"])]
+    if len(here):
+        start_s, stop_s = float(here["start_s"].iloc[0]), max(float(here["stop_s"].iloc[0]), stop_s)
+    return correcting.flip_span(desk.session, start_s, stop_s)
+
+
+def _number(asked: dict[str, Any], name: str) -> float:
+    value = asked.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise SessionError(f"this needs a number for {name}, got {value!r}")
+    return float(value)
+
+
+def _text(asked: dict[str, Any], name: str) -> str:
+    value = asked.get(name, "")
+    if not isinstance(value, str) or len(value) > 200:
+        raise SessionError(f"this needs a text of up to 200 letters for {name}")
+    return value.strip()
+
+
+def binary(times: Array) -> Response:
+    """Times for a page: little-endian float64."""
+    return Response(times.astype("<f8").tobytes(), mimetype="application/octet-stream")
+
+
+def frame_part(desk: Desk, row: int, cached_s: int) -> Response:
+    """PNG of the requested part ?box=left,top,width,height of a frame.
+
+    Args:
+        desk: the session.
+        row: the frame's row.
+        cached_s: how long a browser keeps the image, s.
+
+    Raises:
+        SessionError: there is no such frame or part.
+    """
+    try:
+        box = [int(one) for one in request.args.get("box", "").split(",")]
+    except ValueError:
+        box = []
+    if len(box) != 4 or max(map(abs, box)) > 1 << 16:
+        raise SessionError("a part of an image is left, top, width and height in pixels")
+    answer = Response(desk.image(row, box), mimetype="image/png")
+    answer.headers["Cache-Control"] = f"private, max-age={cached_s}"
+    return answer
