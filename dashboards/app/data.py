@@ -40,7 +40,7 @@ _HELD = 6  # sessions whose tables stay in memory
 
 
 @dataclass(frozen=True)
-class Ethogram:
+class SessionBouts:
     """A session's bouts.
 
     Attributes:
@@ -146,10 +146,10 @@ class StudyData:
         ]
         return pd.DataFrame(rows, columns=["session", *WHO, "state", "reason", "remedy", *QUALITY])
 
-    def ethograms(self, keys: Iterable[str]) -> dict[str, Ethogram]:
+    def ethograms(self, keys: Iterable[str]) -> dict[str, SessionBouts]:
         """The ethograms of measured sessions by key; unreadable ones are left out."""
         found = {entry.key: facts["ethogram"] for entry, facts in self._measured()}
-        return {key: found[key] for key in keys if isinstance(found.get(key), Ethogram)}
+        return {key: found[key] for key in keys if isinstance(found.get(key), SessionBouts)}
 
     def collected(self) -> pd.DataFrame:
         """One row per measured session, as needed by `cohort.compare`, with its `key`.
@@ -263,7 +263,7 @@ QUALITY = (
 )
 
 
-def shown_words(ethograms: Iterable[Ethogram]) -> list[str]:
+def shown_words(ethograms: Iterable[SessionBouts]) -> list[str]:
     """The actions of some ethograms, by decreasing total time."""
     seconds: dict[str, float] = {}
     for one in ethograms:
@@ -291,7 +291,7 @@ def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str
 
 
 def raster(
-    one: Ethogram, words: Sequence[str], start_s: float, stop_s: float, n: int
+    one: SessionBouts, words: Sequence[str], start_s: float, stop_s: float, n: int
 ) -> np.ndarray:
     """(n,) the word with the most time in each of n equal bins of a span.
 
@@ -356,11 +356,11 @@ def _quality(session: Session) -> dict[str, Any]:
     }
 
 
-def _ethogram(session: Session) -> Ethogram:
+def _ethogram(session: Session) -> SessionBouts:
     bouts = session.table("bouts", ["action", "start_s", "stop_s"])
     gaps = session.table("gaps", ["start_s", "stop_s", "n_frames_missing"])
     lost = gaps[gaps["n_frames_missing"] > 0]
-    return Ethogram(
+    return SessionBouts(
         bouts[["start_s", "stop_s"]].to_numpy(float),
         [str(word) for word in bouts["action"]],
         lost[["start_s", "stop_s"]].to_numpy(float),

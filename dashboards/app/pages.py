@@ -49,7 +49,7 @@ from .data import (
     NO_POSE,
     NO_POSE_COLOUR,
     OTHER,
-    Ethogram,
+    SessionBouts,
     StudyData,
     colours_of,
     raster,
@@ -292,7 +292,7 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
 
 
 def _bars(
-    one: Ethogram,
+    one: SessionBouts,
     words: Sequence[str],
     span_s: Span,
     n_rows: int,

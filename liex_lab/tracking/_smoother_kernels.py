@@ -48,8 +48,8 @@ class Moves(NamedTuple):
     correlated_share: float
 
 
-class PoseArrays(NamedTuple):
-    """PoseArrays of n frames as arrays.
+class TrackPoses(NamedTuple):
+    """Poses of n frames as arrays.
 
     Attributes:
         rotation: (n, 3, 3) of the root.
@@ -165,7 +165,7 @@ def place_middles(body, middle, made):
     Args:
         body: `KinematicTree` of the skeleton.
         middle: (n, 3) mm.
-        made: `PoseArrays` whose place and joints are filled.
+        made: `TrackPoses` whose place and joints are filled.
     """
     n_joints = body.parents.size
     made.place[:] = 0.0

@@ -368,14 +368,14 @@ def smooth(
     known = np.isfinite(pose.scale) & np.isfinite(error_mm)
     if not known.any():
         return SmoothedCurve.unknown(n, skeleton.n_joints)
-    measured = kernels.PoseArrays(
+    measured = kernels.TrackPoses(
         pose.root.rotation,
         pose.root.translation,
         pose.angles,
         np.log(pose.scale),
         joints_of(skeleton, pose),
     )
-    made = kernels.PoseArrays(*(np.zeros(values.shape) for values in measured))
+    made = kernels.TrackPoses(*(np.zeros(values.shape) for values in measured))
     spread = kernels.Spread(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
     body, moves = KinematicTree.of(skeleton), motion.packed
     middle, frame, weight = np.empty((n, 3)), np.empty((n, 3, 3)), np.ones(n)
@@ -422,7 +422,7 @@ def smooth(
 
 def _smooth_once(
     seconds: Array,
-    measured: kernels.PoseArrays,
+    measured: kernels.TrackPoses,
     used: NDArray[np.bool_],
     middle: Array,
     r: Array,
@@ -430,7 +430,7 @@ def _smooth_once(
     length: float,
     body: KinematicTree,
     moves: kernels.Moves,
-    made: kernels.PoseArrays,
+    made: kernels.TrackPoses,
     spread: kernels.Spread,
 ) -> None:
     """One filter and smoother pass: fills `made`, and `spread` without the correlated share.
@@ -482,7 +482,7 @@ def _curve(
     error_mm: Array,
     length_mm: float,
     motion: MotionParameters,
-    made: kernels.PoseArrays,
+    made: kernels.TrackPoses,
     spread: kernels.Spread,
     used: NDArray[np.bool_],
 ) -> SmoothedCurve:

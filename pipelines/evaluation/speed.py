@@ -168,7 +168,7 @@ def two_cores() -> Iterator[int]:
 
 
 @dataclass(frozen=True)
-class Footage:
+class SpeedSample:
     """Frames in memory of a rendered recording, its segmentation and the animal's size.
 
     Attributes:
@@ -189,20 +189,20 @@ class Footage:
         recordings: Sequence[TrueRecording],
         subject: PoseEstimator | Baseline,
         n_frames: int,
-    ) -> Footage:
+    ) -> SpeedSample:
         """The first frames of the recording with the widest depth images, repeated as needed."""
         recording = max(recordings, key=lambda one: one.width)
         scene, sample = build_scene(recording, plan_of(animal), subject.skeleton, 96)
         frames = recording.depths(0, min(len(recording), n_frames))
         frames = frames[np.arange(n_frames) % len(frames)]
-        return Footage(frames, scene, sample, subject.find_size(sample, scene))
+        return SpeedSample(frames, scene, sample, subject.find_size(sample, scene))
 
     @property
     def pixels(self) -> str:
         """Size of the depth images, such as `640 x 480`."""
         return f"{self.scene.camera.width} x {self.scene.camera.height}"
 
-    def every(self, step: int) -> Footage:
+    def every(self, step: int) -> SpeedSample:
         """The same frames with every so many-th pixel of rows and columns."""
         frames = np.ascontiguousarray(self.frames[:, ::step, ::step])
         return replace(self, frames=frames, scene=self.scene.every(step))
@@ -231,7 +231,7 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
     progress(0, 5, "rendering frames")
     default = estimator_of(animal, "default")
     recordings = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
-    footage = Footage.of(animal, recordings, default, N_FRAMES)
+    footage = SpeedSample.of(animal, recordings, default, N_FRAMES)
     rivals = _rivals(animal, progress)
     with two_cores() as cores:
         progress(1, 5, "timing the default")
@@ -271,7 +271,7 @@ def _rivals(animal: str, progress: Progress) -> dict[str, PoseEstimator | Baseli
     return rivals
 
 
-def _one_by_one(paper: PoseEstimator, footage: Footage) -> NDArray[Any]:
+def _one_by_one(paper: PoseEstimator, footage: SpeedSample) -> NDArray[Any]:
     """Algorithm 1 as published, from frames to candidate scores, without shared steps."""
     method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
     crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
@@ -299,7 +299,7 @@ def _one_by_one(paper: PoseEstimator, footage: Footage) -> NDArray[Any]:
 
 
 def _stages_and_costs(
-    default: PoseEstimator, footage: Footage
+    default: PoseEstimator, footage: SpeedSample
 ) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
     """Milliseconds per frame on one core by stage, and by number of joints, candidates, pixels."""
     scene, size = footage.scene, footage.size

@@ -28,7 +28,7 @@ from liex_lab.sessions.folder import (
 )
 from liex_lab.sessions.verdict import read_verdict
 
-from .sharing import LOOKING, LookAtSession, Stage, about, input_stamp, read_document
+from .sharing import LOOKING, LookAtSession, MeasuringStage, about, input_stamp, read_document
 from .status import SessionStatus, to_look_at
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def measure_one(
     if run_id and (ended := _ended(session, run_id)):
         return ended
     began = time.perf_counter()
-    stage = Stage(progress)
+    stage = MeasuringStage(progress)
     try:
         if not session.recording_exists:
             raise RecordingError(

@@ -306,7 +306,7 @@ def _shape(labels: Any) -> SharedShape:
     )
 
 
-class Stage:
+class MeasuringStage:
     """Forwards progress, and stores stage and frame for the report of a failure.
 
     Attributes:
@@ -333,7 +333,7 @@ def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, A
         The content of look.json: plan, model and input, and `animal`, `log_sd`, `n_frames`,
             `stated` and `misfits`, or `failure`.
     """
-    stage = Stage(progress)
+    stage = MeasuringStage(progress)
     try:
         return about(session) | _found(session, stage)
     except Exception as error:

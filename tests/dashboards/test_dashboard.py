@@ -25,7 +25,7 @@ from liex_lab.dashboards.app.data import (
     _FACTS,
     GREY,
     NO_POSE,
-    Ethogram,
+    SessionBouts,
     StudyData,
     colours_of,
     raster,
@@ -111,7 +111,7 @@ def test_each_part_of_the_time_has_the_colour_of_what_fills_most_of_it(
     edges: list[float], n: int, words: list[str]
 ) -> None:
     spans = np.array(sorted(edges)[: len(edges) // 2 * 2]).reshape(-1, 2)
-    one = Ethogram(spans[1:], words[: len(spans) - 1], spans[:1], 10.0)
+    one = SessionBouts(spans[1:], words[: len(spans) - 1], spans[:1], 10.0)
     found = raster(one, ["a", "b", "c"], 0.0, 10.0, n)
     for k, place in enumerate(found):
         low, high = 10.0 * k / n, 10.0 * (k + 1) / n
@@ -133,7 +133,9 @@ def test_ethograms_and_budgets_name_a_group_once_and_every_colour_has_a_meaning(
     ]
     shown = StudyData("x", lambda: entries)
     ones = {
-        key: Ethogram(np.array([[0.0, 2.0]]), ["walk"], np.array([[3.0, 4.0]]), end_s, ("walk",))
+        key: SessionBouts(
+            np.array([[0.0, 2.0]]), ["walk"], np.array([[3.0, 4.0]]), end_s, ("walk",)
+        )
         for key, end_s in (("a", 4.0), ("b", 5.0), ("c", 4.0))
     }
     shares = {"walk_share": 0.5, "unlabelled_share": 0.3, "sit_share": 0.2}

@@ -51,7 +51,7 @@ from ...build import build_scene, plan_of
 from ...training.action_model import Scenario, cut_sequences, rendered, staged
 from ...training.pose_model import estimator_of, recipe_of, rendered_set
 from ..pose import Subject, subject_of, unpacked
-from ..speed import Footage, two_cores
+from ..speed import SpeedSample, two_cores
 
 Array = NDArray[np.float64]
 Tests = Mapping[str, Sequence[TrueRecording]]  # by split
@@ -282,7 +282,7 @@ def rates_of(
     Returns:
         By variant `frames_per_s`, `ratio_to_default`, `cores` and `picture`.
     """
-    footage = Footage.of(animal, recordings[:2], next(iter(subjects.values())), _RATE_FRAMES)
+    footage = SpeedSample.of(animal, recordings[:2], next(iter(subjects.values())), _RATE_FRAMES)
     rates = {}
     with two_cores() as cores:
         for name, subject in subjects.items():
