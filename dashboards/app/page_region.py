@@ -110,8 +110,10 @@ class Scenes:
             LiexError: there is no such recording, or it cannot be read.
         """
         session = self._session(key)
-        whole = session is None or request.args.get("of") == "recording"
-        depth = self._whole(key)[0] if whole else self._usual(session)
+        if session is None or request.args.get("of") == "recording":
+            depth = self._whole(key)[0]
+        else:
+            depth = self._usual(session)
         return Response(png(_shaded(depth)), mimetype="image/png")
 
     def scene(self, key: str) -> Response:

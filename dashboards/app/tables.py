@@ -257,7 +257,8 @@ def number(value: Any, places: int | None = None) -> str:
         return str(value)
     if not np.isfinite(value):
         return "–"
-    shown = 0.0 if abs(value) < 1e-12 else float(value)  # rounding error of a sum that is zero
+    exact = float(value)
+    shown = 0.0 if abs(exact) < 1e-12 else exact  # rounding error of a sum that is zero
     whole = abs(shown) >= 1000 or shown == int(shown)
     style = f",.{places}f" if places is not None else ",.0f" if whole else ".3g"
     return f"{shown:{style}}"

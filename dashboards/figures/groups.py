@@ -333,8 +333,14 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
     for k, row in enumerate(rows):
         g = f"g {row['effect_size']:.2f}" if np.isfinite(row["effect_size"]) else "no g"
         p = f"p {row['p']:.2g}\ncorrected {row['p_fdr']:.2g}" if row["test"] else "no test"
-        how = {"xycoords": ("axes fraction", "data"), "va": "center", "size": 5.5, "color": MUTED}
-        axes.annotate(f"{g}\n{p}", (1.02, k), **how)
+        axes.annotate(
+            f"{g}\n{p}",
+            (1.02, k),
+            xycoords=("axes fraction", "data"),
+            va="center",
+            size=5.5,
+            color=MUTED,
+        )
     axes.set_yticks(
         range(len(known)),
         [f"{row['contrast']}\nn = {counted_units(row)}".replace(", ", ",\n") for row in rows],

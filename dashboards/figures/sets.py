@@ -293,7 +293,9 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
                 continue
             svg = image_bytes(figure, "svg")
             made[name] = on_page(svg, name, f"{name.replace('_', ' ')}: {what}")
-            for kind in FORMATS if folder is not None else ():
+            if folder is None:
+                continue
+            for kind in FORMATS:
                 if kind == "svg" or kind in asked or f"{name}.{kind}" in there:
                     image = svg if kind == "svg" else image_bytes(figure, kind)
                     put_figure(folder, f"{name}.{kind}", image)

@@ -295,8 +295,15 @@ def time_budget(animal: SessionAnimal) -> Figure | None:
     axes.barh(range(len(words)), shares, 0.76, color=[colours[word] for word in words])
     for k, (share, n) in enumerate(zip(shares, n_bouts, strict=True)):
         count = "" if n is None else f"n = {n}"
-        how = {"textcoords": "offset points", "va": "center", "size": 5.5, "color": MUTED}
-        axes.annotate(count, (share, k), (2, 0), **how)
+        axes.annotate(
+            count,
+            (share, k),
+            (2, 0),
+            textcoords="offset points",
+            va="center",
+            size=5.5,
+            color=MUTED,
+        )
     name_rows(axes, [word.replace("_", " ") for word in words])
     most = max(1.05 * float(shares.max()), 1.0)
     axes.set(xlim=(0.0, most), xlabel="share of the observed time, %")
@@ -490,13 +497,19 @@ def aligned_curves(animal: SessionAnimal) -> Figure | None:
 def _onsets(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
     """(measure, unit, word, curves) of every action with enough bouts, in the displayed unit."""
     found: list[tuple[str, str, str, Around]] = []
+    moved = animal.kinematics
+    if moved is None:
+        return found
     for curve in (one for one in drawn_curves(animal) if one.column in _AROUND):
         for word in animal.words:
             if curve.column == "nose_height_mm" and not word.startswith("rear"):
                 continue  # constant without rearing
-            one = around_onsets(animal.kinematics, animal.bouts, word, curve.column)
+            one = around_onsets(moved, animal.bouts, word, curve.column)
             if one is not None:
-                three = (shown(some, curve.unit)[0] for some in (one.low, one.median, one.high))
+                low, median, high = (
+                    shown(some, curve.unit)[0] for some in (one.low, one.median, one.high)
+                )
                 unit = shown(1.0, curve.unit)[1]
-                found.append((curve.title, unit, word, Around(one.time_s, *three, one.n)))
+                around = Around(one.time_s, low, median, high, one.n)
+                found.append((curve.title, unit, word, around))
     return found

@@ -97,7 +97,8 @@ def draw_paper(results: Results, further: Mapping[str, Any], folder: Path) -> li
         title = "NYU test frames, 14 points: labels, blue; answer, red"
         written.append(draw_poses(title, further["nyu_hands"], folder / "fig12_nyu_hands.png"))
     if further["tracking"]:
-        written.append(draw_tracking(*further["tracked"], path=folder / "fig18_tracking.png"))
+        sequence, tracked = further["tracked"]
+        written.append(draw_tracking(sequence, tracked, folder / "fig18_tracking.png"))
     if further["actions"]:
         written.append(draw_key_frames(further["key_frames"], folder / "fig19_key_frames.png"))
         written.append(draw_confusions(further["actions"], folder / "fig20_confusions.png"))

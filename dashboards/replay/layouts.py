@@ -65,13 +65,14 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     hidden = [OVERLAY, corrected_entity(OVERLAY), *(f"arena/{name}" for name in measured)]
     scene = _scene(body_m, at(SKELETON), ["$origin/**", *(f"- /{name}/**" for name in hidden)])
     kept = session.get("plan", {}).get("replay", {}).get("depth")
-    # the coordinate frames of the cut-outs in the image, by their entities
-    frames = {
+    # the coordinate frames of the cut-outs in the image, by their entities; rerun's types of
+    # overrides leave them out
+    frames: dict[Any, Any] = {
         cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
         for k in range(N_BOXES)
         for which in range(N_WINDOWS)
     }
-    image = rrb.Spatial2DView(
+    image: Any = rrb.Spatial2DView(
         origin="arena/camera/image",
         contents=[
             "$origin/**",

@@ -275,7 +275,7 @@ def _drawn(
     made = []
     for k, entry in zip(index, entries, strict=True):
         cut, whole = read_cutout(session, entry)
-        if cut is not None:
+        if cut is not None and whole is not None:
             left, top = int(entry["left_px"]), int(entry["top_px"])
             rgb = relief.image(whole, left, top, cut.shape[::-1], cut.shape[::-1])
             uv = poses.loc[poses["frame_index"] == k, ["u_px", "v_px"]].to_numpy(float)

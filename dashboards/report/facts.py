@@ -81,7 +81,7 @@ def warnings(session: Session) -> list[str]:
                 ]
             )
         )
-    summary = session.summary.iloc[0] if behaviour else {}
+    noise = session.summary.iloc[0].get("speed_noise_mm_s", np.nan) if behaviour else np.nan
     return about["problems"] + paragraphs(
         _TEMPLATES / "warnings.j2",
         counted=counted,
@@ -96,7 +96,7 @@ def warnings(session: Session) -> list[str]:
         flips=session.flips,
         disagreements=disagreements(session),
         behaviour=behaviour,
-        noise=summary.get("speed_noise_mm_s", np.nan),
+        noise=noise,
         pause=(about.get("rules") or {}).get("pause_below_mm_s", np.nan),
         schema=about["schema_version"],
         n_gaps=len(session.gaps),

@@ -229,7 +229,7 @@ def write_clips(
                 f"no bout is named {' or '.join(actions)} in {counted(len(sessions), 'session')}; "
                 f"named are {', '.join(map(str, known)) or 'none'}"
             )
-        chosen = {}
+        chosen: dict[str, list[Cell]] = {}
         for name, some in sorted(blocks.items()):
             rows = np.linspace(0, len(some) - 1, min(most, len(some))).round().astype(int)
             chosen |= {name: [some[k] for k in np.unique(rows)]} if some else {}

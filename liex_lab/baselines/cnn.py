@@ -201,7 +201,7 @@ def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:
         nn.Linear(plan.connected, n_outputs),
     )
     # channels last: convolutions on a CPU are about a third faster
-    net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    net.to(memory_format=torch.channels_last)
     return net
 
 

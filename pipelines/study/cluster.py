@@ -27,8 +27,7 @@ from liex_lab.runtime.text_files import read_toml
 from .crew import DEATHS, Crew
 
 if TYPE_CHECKING:
-    from distributed import Client
-    from distributed.deploy.cluster import Cluster
+    from distributed import Client, LocalCluster
 
 
 _FORGOTTEN_S = 8.0  # a nanny whose process is gone for so long does not start another one by itself
@@ -340,7 +339,7 @@ def crew_of(
             raise
 
 
-def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Cluster:
+def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> LocalCluster:
     """Worker processes on this machine, reachable only from it, with keys for this run.
 
     Args:

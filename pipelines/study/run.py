@@ -95,7 +95,7 @@ def _measured(folder: Path) -> verdict.Entry:
         reason = to_look_at(verdict.verdict_in(session.metadata))
     except LiexError as error:
         return verdict.Entry(folder.name, "failed", str(error))
-    who = {name: value for name, value in known.items() if isinstance(value, str) and value}
+    who = {str(name): value for name, value in known.items() if isinstance(value, str) and value}
     return verdict.Entry(session.name, "done", reason, folder=folder, who=who)
 
 

@@ -8,7 +8,7 @@ import io
 import json
 import pickle
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ def repacked(
     content: bytes,
     change: Callable[[dict[str, Any]], Any] = nothing,
     without: str = "-",
-    **arrays: np.ndarray,
+    arrays: Mapping[str, np.ndarray] = {},
 ) -> bytes:
     """A model file whose head was changed, that lacks the entries that begin with `without`, and in
     which arrays were replaced or put in.
@@ -73,7 +73,7 @@ def repacked(
         head = json.loads(kept["head"].tobytes())
         change(head)
         kept["head"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
-    return packed(np.savez, **(kept | arrays))
+    return packed(np.savez, **{**kept, **arrays})
 
 
 def packed(save: Callable[..., None], *values: Any, **named: Any) -> bytes:
@@ -245,7 +245,7 @@ def test_roots_that_lead_outside_of_the_forest_are_refused(tmp_path, content, wh
     for place in (0, len(roots) - 1):
         changed = roots.copy()
         changed[place] = root
-        said = refusal(tmp_path, repacked(content, **{f"{which}_roots": changed}))
+        said = refusal(tmp_path, repacked(content, arrays={f"{which}_roots": changed}))
         assert "roots" in said or "complete trees" in said
 
 
@@ -254,13 +254,13 @@ def test_roots_that_lead_outside_of_the_forest_are_refused(tmp_path, content, wh
 def test_a_test_beyond_the_views_and_scalars_is_refused(tmp_path, content, which, kind):
     kinds = array_of(content, f"{which}_kind").copy()
     kinds[len(kinds) // 2] = kind
-    assert "a test" in refusal(tmp_path, repacked(content, **{f"{which}_kind": kinds}))
+    assert "a test" in refusal(tmp_path, repacked(content, arrays={f"{which}_kind": kinds}))
 
 
 def test_an_offset_that_growth_never_writes_is_refused(tmp_path, content):
     tests = array_of(content, "000_tests").copy()
     tests[3, -1] = -128
-    assert "an offset" in refusal(tmp_path, repacked(content, **{"000_tests": tests}))
+    assert "an offset" in refusal(tmp_path, repacked(content, arrays={"000_tests": tests}))
 
 
 @pytest.mark.parametrize("part", ["tests", "threshold", "kind", "is_leaf", "roots", "leaves"])
@@ -268,13 +268,13 @@ def test_arrays_of_a_forest_of_another_size_or_type_are_refused(tmp_path, conten
     name = f"000_{part}"
     values = array_of(content, name)
     for changed in (values[..., :-1], values.astype(np.float64), values[None], values[..., :0]):
-        assert "model" in refusal(tmp_path, repacked(content, **{name: changed}))
+        assert "model" in refusal(tmp_path, repacked(content, arrays={name: changed}))
 
 
 def test_leaves_that_are_not_finite_or_of_another_width_are_refused(tmp_path, content):
     leaves = array_of(content, "000_leaves")
     for changed in (leaves * np.float16(np.nan), leaves[:-1]):
-        assert "its leaves" in refusal(tmp_path, repacked(content, **{"000_leaves": changed}))
+        assert "its leaves" in refusal(tmp_path, repacked(content, arrays={"000_leaves": changed}))
 
 
 @pytest.mark.parametrize(
@@ -304,10 +304,13 @@ def test_numbers_of_the_method_that_make_no_sense_are_refused(
 
 
 def test_tables_of_another_skeleton_are_refused(tmp_path, content):
-    assert "ridge" in refusal(tmp_path, repacked(content, settler=np.zeros((3, 3))))
+    assert "ridge" in refusal(tmp_path, repacked(content, arrays={"settler": np.zeros((3, 3))}))
     for weights in (np.zeros((5, 3)), np.zeros((5, 4)), np.zeros(4)):
-        layer = {"facing_0_bias": np.zeros(4, np.float16), "facing_0_weights": np.float16(weights)}
-        assert "layers of a network" in refusal(tmp_path, repacked(content, **layer))
+        layer = {
+            "facing_0_bias": np.zeros(4, np.float16),
+            "facing_0_weights": weights.astype(np.float16),
+        }
+        assert "layers of a network" in refusal(tmp_path, repacked(content, arrays=layer))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -457,7 +457,7 @@ _VARIED = {  # the five parameters, as attributes of a method or of a part of it
 
 def chosen_values(method: Method) -> dict[str, int]:
     """The method's own value of each of the five parameters."""
-    return {name: reduce(getattr, path, method) for name, path in _VARIED.items()}
+    return {name: attrgetter(".".join(path))(method) for name, path in _VARIED.items()}
 
 
 def with_value(method: Method, number: str, value: int) -> Method:

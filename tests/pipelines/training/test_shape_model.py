@@ -101,4 +101,4 @@ def test_the_bundled_shapes_make_the_error_of_unseen_builds_smaller(others):
 
 def test_animals_that_are_no_tube_are_refused():
     with pytest.raises(LiexError, match="one chain with a tube"):
-        list(mini_sessions(SimpleNamespace(skeleton=Skeleton.load("hand")), "wide", 1))  # type: ignore[arg-type]
+        list(mini_sessions(SimpleNamespace(skeleton=Skeleton.load("hand")), "wide", 1))
