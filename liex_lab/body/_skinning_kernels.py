@@ -14,6 +14,7 @@ tail needs that frame's z up and its floor at z = 0.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,24 @@ TAIL_RINGS = 12
 TAIL_SEGMENTS = 6
 CAPSULE_RINGS = 6
 CAPSULE_SEGMENTS = 10
+
+
+class TubeBodies(NamedTuple):
+    """The shapes of n animals with a tubular body, see `BodyShape`.
+
+    Attributes:
+        half_width: (n, R) mm.
+        half_height: (n, R) mm.
+        power: (n,) of the superellipses.
+        blobs: (n, B, 6) ellipsoids.
+        tail: (n, 3) length, radius at the rump, radius at the tip.
+    """
+
+    half_width: Any
+    half_height: Any
+    power: Any
+    blobs: Any
+    tail: Any
 
 
 def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
@@ -316,21 +335,7 @@ def skin_tube(
 
 
 @kernel(nogil=True)
-def skin_tubes(
-    joints,
-    rotations,
-    girth,
-    stations,
-    half_width,
-    half_height,
-    power,
-    blobs,
-    tail,
-    bends,
-    out,
-    start,
-    stop,
-):
+def skin_tubes(joints, rotations, girth, stations, bodies, bends, out, start, stop):
     """`skin_tube` for a batch.
 
     Args:
@@ -338,11 +343,7 @@ def skin_tubes(
         rotations: (n, J, 3, 3).
         girth: (n,).
         stations: (R,), shared.
-        half_width: (n, R) mm.
-        half_height: (n, R) mm.
-        power: (n,).
-        blobs: (n, B, 6).
-        tail: (n, 3).
+        bodies: `TubeBodies`.
         bends: (n, TAIL_RINGS) rad.
         out: (n, V, 3) mm, out.
         start: first item to process, see `in_parallel`.
@@ -354,11 +355,11 @@ def skin_tubes(
             rotations[i],
             girth[i],
             stations,
-            half_width[i],
-            half_height[i],
-            power[i],
-            blobs[i],
-            tail[i],
+            bodies.half_width[i],
+            bodies.half_height[i],
+            bodies.power[i],
+            bodies.blobs[i],
+            bodies.tail[i],
             bends[i],
             out[i],
         )

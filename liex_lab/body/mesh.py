@@ -13,6 +13,7 @@ apart.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,7 +159,7 @@ class MeshBody:
         check_index("the skeleton's joints", self.bones, skeleton.n_joints)
         body = self.broadcast(n)
         out = np.empty((len(positions), self.n_vertices, 3))
-        carrier = skeleton.parents[self.bones]
+        skin = _Skin(skeleton.parents[self.bones], self.bones, self.weight, self.along, self.across)
         in_parallel(
             _skin_mesh,
             n,
@@ -166,45 +167,45 @@ class MeshBody:
             positions,
             scale,
             girth,
-            carrier,
-            self.bones,
-            self.weight,
-            self.along,
-            self.across,
+            skin,
             body.width,
             out,
         )
         return out
 
 
+class _Skin(NamedTuple):
+    """How V vertices follow their B bones, see `MeshBody`.
+
+    Attributes:
+        carrier: (V, B) the joints that carry the bones.
+        bones: (V, B) the joints that end them.
+        weight: (V, B).
+        along: (V, B, 3) mm.
+        across: (V, B, 3) mm.
+    """
+
+    carrier: Any
+    bones: Any
+    weight: Any
+    along: Any
+    across: Any
+
+
 @kernel(nogil=True)
-def _skin_mesh(
-    rotations,
-    positions,
-    scale,
-    girth,
-    carrier,
-    bones,
-    weight,
-    along,
-    across,
-    width,
-    out,
-    start,
-    stop,
-):
-    """Linear blend skinning of a batch into out (n, V, 3); carrier (V, B) joints."""
+def _skin_mesh(rotations, positions, scale, girth, skin, width, out, start, stop):
+    """Linear blend skinning of a batch into out (n, V, 3)."""
     for i in range(start, stop):
-        for v in range(len(weight)):
+        for v in range(len(skin.weight)):
             for axis in range(3):
                 out[i, v, axis] = 0.0
-            for b in range(weight.shape[1]):
-                j = carrier[v, b]
-                thick = girth[i] * 0.5 * (width[i, j] + width[i, bones[v, b]])
+            for b in range(skin.weight.shape[1]):
+                j = skin.carrier[v, b]
+                thick = girth[i] * 0.5 * (width[i, j] + width[i, skin.bones[v, b]])
                 for axis in range(3):
                     total = positions[i, j, axis]
                     for k in range(3):
                         total += rotations[i, j, axis, k] * (
-                            scale[i] * along[v, b, k] + thick * across[v, b, k]
+                            scale[i] * skin.along[v, b, k] + thick * skin.across[v, b, k]
                         )
-                    out[i, v, axis] += weight[v, b] * total
+                    out[i, v, axis] += skin.weight[v, b] * total

@@ -207,6 +207,9 @@ class Surface:
             if bends is None
             else np.asarray(bends, float)
         )
+        bodies = skinning_kernels.TubeBodies(
+            body.half_width, body.half_height, body.power, body.blobs, body.tail
+        )
         with threads(parallel and n > _FEW):
             in_parallel(
                 skinning_kernels.skin_tubes,
@@ -215,11 +218,7 @@ class Surface:
                 rotations,
                 size,
                 self.stations,
-                body.half_width,
-                body.half_height,
-                body.power,
-                body.blobs,
-                body.tail,
+                bodies,
                 turns,
                 out,
             )

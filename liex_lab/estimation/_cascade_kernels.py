@@ -79,6 +79,20 @@ class Trees(NamedTuple):
     widths: Any
 
 
+class Forests(NamedTuple):
+    """The forests of a method.
+
+    Attributes:
+        regressors: `Trees`, one forest per solved joint and round, in order.
+        pruner: one forest, which scores candidates by the base joint alone.
+        metric: one forest, the learned metric.
+    """
+
+    regressors: Trees
+    pruner: Trees
+    metric: Trees
+
+
 class CascadeSettings(NamedTuple):
     """The method's settings of the cascade.
 
@@ -472,30 +486,14 @@ def _estimate_block(
 
 
 @kernel(nogil=True)
-def estimate_all(
-    batch,
-    frames,
-    tree,
-    regressors,
-    pruner,
-    metric,
-    tuning,
-    body,
-    starts,
-    poses,
-    scores,
-    start,
-    stop,
-):
+def estimate_all(batch, frames, tree, forests, tuning, body, starts, poses, scores, start, stop):
     """Run Lie-X Algorithm 1 for blocks of `FRAMES` frames with an animal.
 
     Args:
         batch: `FrameBatch`.
         frames: (m,) the frames with an animal.
         tree: `KinematicTree` of the skeleton.
-        regressors: one forest per solved joint and round, in order.
-        pruner: one forest, which scores candidates by the base joint alone.
-        metric: one forest, the learned metric.
+        forests: `Forests`.
         tuning: the method's settings.
         body: sphere model whose residuals the metric uses; empty if it uses none.
         starts: `CandidatePoses` of the K bases alone (J = 1); changed in place.
@@ -510,9 +508,9 @@ def estimate_all(
             batch,
             frames[b * FRAMES : (b + 1) * FRAMES],
             tree,
-            regressors,
-            pruner,
-            metric,
+            forests.regressors,
+            forests.pruner,
+            forests.metric,
             tuning,
             body,
             starts,

@@ -14,6 +14,8 @@ or the upright camera frame of the paper's variant.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from liex_lab.forests._kernels import (
@@ -32,6 +34,18 @@ N_SCALARS = 11
 # a threshold is an integer: logarithms and sines are scaled up to resolve a few thousandths
 _LOG_UNIT = 500.0
 _MM_UNIT = 16.0
+
+
+class FeatureRows(NamedTuple):
+    """The features of n candidates, filled.
+
+    Attributes:
+        views: (n, V, 9) float32, from V joints.
+        scalars: (n, N_SCALARS) float32, not filled if it has no columns.
+    """
+
+    views: Any
+    scalars: Any
 
 
 @kernel()
@@ -258,8 +272,7 @@ def all_features(
     rotations,
     positions,
     scale,
-    views,
-    scalars,
+    rows,
     start,
     stop,
 ):
@@ -275,8 +288,7 @@ def all_features(
         rotations: (n, J, 3, 3) joint frames, view frame.
         positions: (n, J, 3) joints, mm, view frame.
         scale: (n,) of the bones.
-        views: (n, V, 9) float32, filled.
-        scalars: (n, N_SCALARS) float32, filled unless it has no columns.
+        rows: `FeatureRows`, filled.
         start: first item to process, see `in_parallel`.
         stop: the item after the last.
     """
@@ -289,16 +301,16 @@ def all_features(
                 crop_cameras[i],
                 size[s],
                 reach[v],
-                views[s, v],
+                rows.views[s, v],
             )
-        if scalars.shape[1] > 0:
+        if rows.scalars.shape[1] > 0:
             fill_scalars(
                 rotations[s, joints[0]],
                 positions[s, joints[0]],
                 scale[s],
                 moments[i],
                 size[s],
-                scalars[s],
+                rows.scalars[s],
             )
 
 

@@ -52,6 +52,22 @@ class Readings(NamedTuple):
     nearest: Any
 
 
+class MovedPoses(NamedTuple):
+    """K poses in each of n frames, changed in place.
+
+    Attributes:
+        root_rotations: (n, K, 3, 3).
+        root_positions: (n, K, 3) mm.
+        angles: (n, K, J, 3) rad.
+        scales: (n, K).
+    """
+
+    root_rotations: Any
+    root_positions: Any
+    angles: Any
+    scales: Any
+
+
 class ResidualWeights(NamedTuple):
     """Weights of the residuals.
 
@@ -496,19 +512,7 @@ def refine_one(
 
 @kernel(nogil=True)
 def refine_all(
-    heights,
-    crop_cameras,
-    tree,
-    free_angles,
-    body,
-    weights,
-    n_steps,
-    root_rotations,
-    root_positions,
-    angles,
-    scales,
-    start,
-    stop,
+    heights, crop_cameras, tree, free_angles, body, weights, n_steps, poses, start, stop
 ):
     """`refine_one` for the K poses of each of n frames.
 
@@ -520,10 +524,7 @@ def refine_all(
         body: the sphere model.
         weights: of the residuals.
         n_steps: number of steps.
-        root_rotations: (n, K, 3, 3), changed in place.
-        root_positions: (n, K, 3) mm, changed in place.
-        angles: (n, K, J, 3) rad, changed in place.
-        scales: (n, K), changed in place.
+        poses: `MovedPoses`, changed in place.
         start: first item to process, see `in_parallel`.
         stop: the item after the last.
     """
@@ -532,8 +533,8 @@ def refine_all(
             _readings(heights[i], crop_cameras[i]),
             np.full((heights.shape[1], heights.shape[1], 2), -1, np.int32),
         )
-        for k in range(scales.shape[1]):
-            scales[i, k] = refine_one(
+        for k in range(poses.scales.shape[1]):
+            poses.scales[i, k] = refine_one(
                 heights[i],
                 crop_cameras[i],
                 readings,
@@ -542,8 +543,8 @@ def refine_all(
                 body,
                 weights,
                 n_steps,
-                root_rotations[i, k],
-                root_positions[i, k],
-                angles[i, k],
-                scales[i, k],
+                poses.root_rotations[i, k],
+                poses.root_positions[i, k],
+                poses.angles[i, k],
+                poses.scales[i, k],
             )

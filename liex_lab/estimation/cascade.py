@@ -249,8 +249,7 @@ class Cascade:
             candidates.rotations,
             candidates.positions,
             candidates.scale,
-            views,
-            scalars,
+            kernels.FeatureRows(views, scalars),
         )
         inverse_size = (1.0 / candidates.size).astype(np.float32)
         return Samples(images.heights, candidates.image, inverse_size, views, scalars)

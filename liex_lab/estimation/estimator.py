@@ -181,15 +181,16 @@ class PoseEstimator:
         return self.model.skeleton
 
     @cached_property
-    def _packed(self) -> tuple[kernels.Trees, kernels.Trees, kernels.Trees]:
-        """Regressors, pruner and metric as records for the kernels."""
+    def _packed(self) -> kernels.Forests:
+        """The forests as records for the kernels."""
         model = self.model
         try:
             check_model(model)
         except ValueError as error:
             raise ModelError(f"this model cannot be used ({error}); train it again") from None
         regressors = [forest for rounds in model.cascade.forests for forest in rounds]
-        return _pack(regressors), _pack([model.pruner or model.metric]), _pack([model.metric])
+        pruner = model.pruner or model.metric
+        return kernels.Forests(_pack(regressors), _pack([pruner]), _pack([model.metric]))
 
     @cached_property
     def _body(self) -> SphereModel:
@@ -273,7 +274,7 @@ class PoseEstimator:
                 kernels.FrameBatch(crops.heights, crop_cameras, crops.moments, size),
                 np.flatnonzero(crops.found),
                 KinematicTree.of(skeleton),
-                *self._packed,
+                self._packed,
                 settings,
                 self._body,
                 starts,

@@ -172,8 +172,7 @@ def views_along_axis(
         rotation[:, None],
         position[:, None],
         each,
-        views,
-        scalars,
+        kernels.FeatureRows(views, scalars),
     )
     # some segmenters determine the direction of the long axis
     rows = np.column_stack([scalars, (1000.0 - 2000.0 * opposite).astype(np.float32)])

@@ -132,10 +132,7 @@ class Refiner:
             self.body,
             weights,
             n_steps,
-            root.rotation,
-            root.translation,
-            moved.angles,
-            moved.scale,
+            kernels.MovedPoses(root.rotation, root.translation, moved.angles, moved.scale),
         )
         return moved
 

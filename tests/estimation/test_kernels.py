@@ -109,8 +109,7 @@ def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
         rotations,
         positions,
         scale,
-        views,
-        scalars,
+        kernels.FeatureRows(views, scalars),
     )
     for s in range(n):
         own = np.empty(kernels.N_SCALARS)
