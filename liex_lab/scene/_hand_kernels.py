@@ -504,7 +504,7 @@ def extract_one(depth, n_candidates, sight, crops, k):
         if rank < n_alike:
             end = ends[ranked[rank]]
             surface = surfaces[labels[int(end[END_ROW]), int(end[END_COLUMN])]]
-            cut_end(depth, blocks, labels, surface, end, sight, crops, k)
+            cut_end(depth, blocks, labels, surface, end, sight, crops, row)
 
 
 @inner_kernel()

@@ -212,7 +212,7 @@ def extract_one(depth, limit, on_floor, area, n_candidates, parts, sight, crops,
         if rank < n_near:
             slot = order[rank]
             blob = blob_kernels.unpack_blob(blobs[slot])
-            cut_crop(depth, limit, labels, slot, blob, sight, crops, k)
+            cut_crop(depth, limit, labels, slot, blob, sight, crops, row)
             crops.n_px[row] = int(blob.n_px)
 
 
