@@ -60,6 +60,15 @@ def test_the_hand_is_what_is_cut_out() -> None:
     assert np.median(off) < 40.0
 
 
+def test_the_second_candidate_is_cut_into_rows_of_its_own() -> None:
+    session, depths = people()
+    scene, size = scene_of(session.camera), session.spine_mm / HAND.length
+    first, second = scene.extract_both(depths, size)
+    np.testing.assert_array_equal(first.heights, scene.extract(depths, size).heights)
+    assert second.found.any()
+    np.testing.assert_array_equal(second.found, second.n_blobs > 1)
+
+
 def drawn_arm(
     wrist: tuple[int, int], elbow: tuple[int, int], hand_mm: float, body: bool
 ) -> np.ndarray:
