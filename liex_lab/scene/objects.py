@@ -266,7 +266,7 @@ def _inspected(scene: Scene, sample: Depths, target: TargetAnimal) -> tuple[bool
         and height > _HIGHER * target.min_height_mm
         and scene.area_mm2 > _LARGER * target.smallest_mm2
     )
-    centroid = shown.centroid[:, :2]
+    centroid = np.column_stack([blobs.x, blobs.y])
     off = np.linalg.norm(centroid - np.median(centroid, axis=0), axis=1)
     stays = (off < 0.5 * np.sqrt(scene.area_mm2)).mean() > _IN_PLACE
     return is_like, bool(stays)

@@ -254,7 +254,7 @@ CALLS: list[tuple[str, str, Any, tuple[Any, ...], dict[str, Any], str]] = [
     ),
     (
         "evaluate speed --recordings",
-        "evaluation.recordings.evaluate_recordings",
+        "evaluation.speed.evaluate_recordings",
         {"frames_per_s_1core": {"mcap": 400.0}},
         (),
         {},

@@ -174,7 +174,8 @@ def test_a_recording_that_is_there_twice_counts_once(study, tmp_path, same_input
         link_tree(study / f"sub-m{k}" / f"s{k}.liex", tmp_path / f"s{k}.liex")
     link_tree(tmp_path / "s1.liex", tmp_path / "twin.liex")
     if not same_input:  # as from another container: other bytes, the same depth
-        edit_json(tmp_path / "twin.liex", input={"name": "s1", "sha256": "1" * 64})
+        stored = json.loads((tmp_path / "twin.liex" / "session.json").read_text())["input"]
+        edit_json(tmp_path / "twin.liex", input=stored | {"sha256": "1" * 64})
     found = compare([tmp_path], tmp_path / "out", ["distance_m"])
     assert found["sessions"].endswith("10 compared: twin same recording as s1")
     assert found["check"] == ["twin is the same recording as s1, and is not counted"]

@@ -59,7 +59,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int]:
     names = [f"good{k}" for k in range(3)] + ["unlucky", *BROKEN, "last"]
     file = make_study(folder, [*names, "skipped"], skipped='exclude = "fell asleep"')
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(api, "run_session", pretended_run)
+        patch.setattr("liex_lab.pipelines.session.run_session", pretended_run)
         result = CliRunner().invoke(cli.app, ["cohort", str(file), "--workers", "2"])
     return file, result.output, result.exit_code
 
@@ -206,8 +206,8 @@ def test_who_an_animal_is_changes_without_measuring(
     def never(*_: object, **__: object) -> Path:
         raise AssertionError("it measured")
 
-    monkeypatch.setattr(api, "correct_session", describe)
-    monkeypatch.setattr(api, "run_session", never)
+    monkeypatch.setattr("liex_lab.pipelines.correct.correct_session", describe)
+    monkeypatch.setattr("liex_lab.pipelines.session.run_session", never)
     runs = (tmp_path / "good.runs").stat().st_size
     api.run_study(file, workers=1)
     folder = Study.load(file).sessions[0].folder
