@@ -184,19 +184,24 @@ class Pages:
 
     def whole(self, key: str) -> Response:
         """The ethogram and the curves of a session, or of its stretch from ?from= to ?to= (s)."""
-        animals = self._desks.of(key).animals
-        span = _span(animals[0].duration_s)
+        span = _span(self._desks.of(key).animals[0].duration_s)
         part = span if "from" in request.args else None
+
+        def figures(_: Session) -> list[Figure | None]:
+            animals = self._desks.of(key).animals
+            return [draw(one, part) for one in animals for draw in (times.ethogram, times.curves)]
+
         with drawing():
-            drawn = [draw(one, part) for one in animals for draw in (times.ethogram, times.curves)]
-            return _timed("whole", drawn, span, TWO_COLUMNS_MM)
+            return _timed("whole", self.data.read(key, figures), span, TWO_COLUMNS_MM)
 
     def moment(self, key: str) -> Response:
         """The curves around ?t= (s), the values of its frame, and the command of its replay."""
         at_s = _moment()
         span = (at_s - _HALF_S, at_s + _HALF_S)
         with drawing():
-            figure = times.curves(self._desks.of(key).animals[0], span, _AROUND_MM)
+            figure = self.data.read(
+                key, lambda _: times.curves(self._desks.of(key).animals[0], span, _AROUND_MM)
+            )
             values = self.data.read(key, lambda session: facts(session, at_s))
             path = self.data.session(key).path
             command = f"liex show {shlex.quote(str(path))} --at {at_s:.3f}"
@@ -222,7 +227,9 @@ class Pages:
         if name not in sets.OF_SESSION:
             raise NotFound
         with drawing():
-            _, _, drawn = next(sets.session_figures(self.data.session(key), [name]))
+            _, _, drawn = self.data.read(
+                key, lambda session: next(sets.session_figures(session, [name]))
+            )
             return _download(drawn)
 
 

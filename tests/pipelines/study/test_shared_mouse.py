@@ -30,7 +30,7 @@ def test_two_sessions_of_one_mouse_have_one_length_and_the_report_says_whose(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("liex_lab.pipelines.study.run.crew_of", here)
-    file = make_study(tmp_path / "study", [3, 4], 16)
+    file = make_study(tmp_path / "study", [3, 4], 40)
     assert {status.state for status in api.run_study(file)} == {"done"}
     found, animals = [], []
     for session in Study.load(file).sessions:
