@@ -261,6 +261,7 @@ def test_f_exchanges_head_and_tail_in_the_marked_span_and_u_takes_it_back(
     page.keyboard.press("F")  # with Shift, and where nothing is marked: this frame alone
     expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged in frames")
     expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    expect(page.locator(".desk-said")).to_contain_text("disagrees with the frames around it")
     until(page, lambda: bool(held))
     page.keyboard.press("x")  # right after a correction: one of the new ones
     expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
