@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
 from liex_lab.behaviour.summary import Behaviour, measure_rows, stated_by
-from liex_lab.body.fitting import fit_poses
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import Pose, fit_poses
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from liex_lab.evaluation.scores import Followed, MeasuredIndividual
 from liex_lab.recordings.formats.images.nyu import POINTS
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.simulation.scenes.recording import TrueAnimal
-from liex_lab.simulation.tracking_sequences import TestSequence
+from liex_lab.simulation.scenes.stage import TrueAnimal
+from liex_lab.simulation.simulator import TestSequence
 
 Array = NDArray[np.float64]
 Edges = Sequence[tuple[int, int]]

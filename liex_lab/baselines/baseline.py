@@ -42,7 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.baselines import _kernels as kernels
-from liex_lab.body.kinematics import KinematicTree, forward_kinematics
+from liex_lab.body.pose import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.cascade import TrainingSet

@@ -13,32 +13,22 @@ import math
 
 import numpy as np
 
-from liex_lab.runtime.kernels import inner_kernel, kernel
+from liex_lab.runtime.kernels import kernel
 
 NEAR_MM = 1.0
 
 
 @kernel()
-def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse):
-    """Draw triangles into an image of inverse depth.
-
-    Keeps the largest 1 / z under each pixel's centre. Triangles that reach behind NEAR_MM are
-    omitted.
+def project(vertices, rotation, translation, intrinsics, projected):
+    """Project the vertices of a mesh.
 
     Args:
         vertices: (V, 3) mm in a frame that (rotation, translation) transforms to the camera's.
-        faces: (F, 3) int32.
         rotation: (3, 3).
         translation: (3,) mm.
-        fx: focal length, px.
-        fy: focal length, px.
-        cx: principal point, px.
-        cy: principal point, px.
-        u0: image column of `inverse[0, 0]`.
-        v0: image row of `inverse[0, 0]`.
-        inverse: (H, W) 1/mm, changed in place; 0 for empty pixels.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        projected: (V, 3) u and v px and 1 / z, out; 1 / z is 0 up to NEAR_MM before the camera.
     """
-    projected = np.empty((vertices.shape[0], 3))
     for i in range(vertices.shape[0]):
         x = vertices[i, 0]
         y = vertices[i, 1]
@@ -47,16 +37,43 @@ def draw(vertices, faces, rotation, translation, fx, fy, cx, cy, u0, v0, inverse
         yc = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
         zc = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
         if zc > NEAR_MM:
-            projected[i, 0] = fx * xc / zc + cx - u0
-            projected[i, 1] = fy * yc / zc + cy - v0
+            projected[i, 0] = intrinsics[0] * xc / zc + intrinsics[2]
+            projected[i, 1] = intrinsics[1] * yc / zc + intrinsics[3]
             projected[i, 2] = 1.0 / zc
         else:
             projected[i, 2] = 0.0
+
+
+@kernel()
+def draw_projected(projected, faces, u0, v0, inverse):
+    """Draw triangles into an image of inverse depth.
+
+    Keeps the largest 1 / z under each pixel's centre. Triangles that reach behind NEAR_MM are
+    omitted.
+
+    Args:
+        projected: (V, 3) as in `project`; shifted in place.
+        faces: (F, 3) int32.
+        u0: image column of `inverse[0, 0]`.
+        v0: image row of `inverse[0, 0]`.
+        inverse: (H, W) 1/mm, changed in place; 0 for empty pixels.
+    """
+    for i in range(projected.shape[0]):
+        projected[i, 0] -= u0
+        projected[i, 1] -= v0
     for f in range(faces.shape[0]):
         _draw_triangle(projected, faces[f, 0], faces[f, 1], faces[f, 2], inverse)
 
 
-@inner_kernel()
+@kernel()
+def draw(vertices, faces, rotation, translation, intrinsics, u0, v0, inverse):
+    """Draw the triangles of a mesh, see `project` and `draw_projected`."""
+    projected = np.empty((vertices.shape[0], 3))
+    project(vertices, rotation, translation, intrinsics, projected)
+    draw_projected(projected, faces, u0, v0, inverse)
+
+
+@kernel()
 def _draw_triangle(p, a, b, c, inverse):
     """Draw the triangle of rows a, b, c of `p` (V, 3): pixel column, pixel row, 1 / z."""
     if p[a, 2] <= 0.0 or p[b, 2] <= 0.0 or p[c, 2] <= 0.0:
@@ -113,7 +130,7 @@ def to_depth(inverse, depth):
 
 @kernel(nogil=True)
 def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth, start, stop):
-    """Depth images of n meshes; see `draw`.
+    """Depth images of n meshes; see `draw_projected`.
 
     Args:
         vertices: (n, V, 3) mm.
@@ -134,10 +151,7 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
             faces,
             rotation[i],
             translation[i],
-            intrinsics[i, 0],
-            intrinsics[i, 1],
-            intrinsics[i, 2],
-            intrinsics[i, 3],
+            intrinsics[i],
             origin[i, 0],
             origin[i, 1],
             inverse,

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.geometry._kernels import exp_so3
-from liex_lab.runtime.kernels import inner_kernel, kernel
+from liex_lab.runtime.kernels import kernel
 
 BODY_SEGMENTS = 16
 BLOB_RINGS = 4
@@ -86,7 +86,7 @@ def joined_faces(tubes: list[tuple[int, int]]) -> NDArray[np.int32]:
     return np.concatenate(faces)
 
 
-@inner_kernel()
+@kernel()
 def spine_frame(joints, rotations, arc, station, out):
     """Centre, forward, left and up of the mid-axis at one station.
 
@@ -141,7 +141,15 @@ def spine_frame(joints, rotations, arc, station, out):
     _cross(out, 1, 2, 3)
 
 
-@inner_kernel()
+@kernel()
+def _set(rows, k, x, y, z):
+    """Set row k of `rows` (., 3)."""
+    rows[k, 0] = x
+    rows[k, 1] = y
+    rows[k, 2] = z
+
+
+@kernel()
 def _normalise(rows, k):
     """Scale row k of `rows` (., 3) to unit length."""
     length = math.sqrt(rows[k, 0] ** 2 + rows[k, 1] ** 2 + rows[k, 2] ** 2)
@@ -149,18 +157,16 @@ def _normalise(rows, k):
         rows[k, axis] /= length
 
 
-@inner_kernel()
+@kernel()
 def _cross(rows, a, b, out):
     """Set row `out` to the cross product of rows a and b of `rows` (., 3)."""
     x = rows[a, 1] * rows[b, 2] - rows[a, 2] * rows[b, 1]
     y = rows[a, 2] * rows[b, 0] - rows[a, 0] * rows[b, 2]
     z = rows[a, 0] * rows[b, 1] - rows[a, 1] * rows[b, 0]
-    rows[out, 0] = x
-    rows[out, 1] = y
-    rows[out, 2] = z
+    _set(rows, out, x, y, z)
 
 
-@inner_kernel()
+@kernel()
 def chain_arc(joints, arc):
     """The chain's length up to each joint.
 
@@ -209,7 +215,7 @@ def _body(
     return at
 
 
-@inner_kernel()
+@kernel()
 def ellipsoid(frame, radii, out, start):
     """An ellipsoid's vertices.
 
@@ -242,7 +248,7 @@ def ellipsoid(frame, radii, out, start):
     return at
 
 
-@inner_kernel()
+@kernel()
 def _blob(joints, rotations, arc, girth, blob, frame, out, start):
     """One ear or foot: `blob` = station, left, up of its centre, its three radii, mm at scale 1;
     radius 0 hides it.
@@ -267,9 +273,7 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
     z = frame[0, 2]
     if girth * tail[0] <= 0.0:
         for k in range(TAIL_RINGS * TAIL_SEGMENTS + 2):
-            out[start + k, 0] = x
-            out[start + k, 1] = y
-            out[start + k, 2] = z
+            _set(out, start + k, x, y, z)
         return start + TAIL_RINGS * TAIL_SEGMENTS + 2
     heading = math.atan2(-frame[1, 1], -frame[1, 0])
     if (
@@ -278,9 +282,7 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
         heading = math.atan2(frame[3, 1], frame[3, 0])
     step = girth * tail[0] / TAIL_RINGS
     at = start
-    out[at, 0] = x
-    out[at, 1] = y
-    out[at, 2] = z
+    _set(out, at, x, y, z)
     at += 1
     for r in range(TAIL_RINGS):
         share = (r + 1.0) / TAIL_RINGS
@@ -293,18 +295,20 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
         z = z - fall
         for k in range(TAIL_SEGMENTS):
             phi = 2.0 * math.pi * k / TAIL_SEGMENTS
-            side = radius * math.cos(phi)
-            out[at, 0] = x - side * math.sin(heading)
-            out[at, 1] = y + side * math.cos(heading)
-            out[at, 2] = z + radius * math.sin(phi)
+            across = radius * math.cos(phi)
+            _set(
+                out,
+                at,
+                x - across * math.sin(heading),
+                y + across * math.cos(heading),
+                z + radius * math.sin(phi),
+            )
             at += 1
-    out[at, 0] = x
-    out[at, 1] = y
-    out[at, 2] = z
+    _set(out, at, x, y, z)
     return at + 1
 
 
-@inner_kernel()
+@kernel()
 def skin_tube(
     joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
 ):
@@ -403,7 +407,7 @@ def skin_capsules(rotations, joints, scale, girth, which, offsets, radii, out, s
             )
 
 
-@inner_kernel()
+@kernel()
 def _capsule(first, last, first_radius, last_radius, frame, out, start):
     """A tube around one bone: half its rings round off each end."""
     length = 0.0

@@ -1,31 +1,60 @@
-"""Parametric body shapes of a tubular animal, and random families to draw animals from.
+"""Bodies around a skeleton: a tube along a spine, tapered capsules, or a user's own mesh.
 
-The trunk is a generalised cylinder: superellipses |x / a|^p + |y / b|^p = 1 across the mid-axis
-(Barr 1981), with half widths a and half heights b at stations along the spine; ears and feet are
-ellipsoids, the tail is a thin tube. A family draws smooth random factors for the profiles, so that
-a model trained on rendered animals covers the variation of real ones (domain randomisation).
+A tubular trunk is a generalised cylinder: superellipses |x / a|^p + |y / b|^p = 1 across the
+mid-axis (Barr 1981), with half widths a and half heights b at stations along the spine; ears and
+feet are ellipsoids, the tail is a thin tube. `Spheres` approximates any body along its bones.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body._skinning_kernels import TAIL_RINGS
+from liex_lab.body import _skinning_kernels as skinning_kernels
+from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
+from liex_lab.runtime.kernels import kernel
+from liex_lab.runtime.shapes import Rows, check_index, check_shapes
+from liex_lab.runtime.threads import in_parallel
 
 Array = NDArray[np.float64]
 
-FAMILIES = ("train", "augmented", "wide", "other")
-_WILD_SHARE = 0.6
-_HULL_SHARE = 0.5  # of the wild ones
+
+class Body(Rows):
+    """The body of one animal, or of a batch (n) of animals.
+
+    Attributes:
+        fur: () or (n,) from 0 (sleek) to 1 (long and soft): how much a sensor loses at the outline.
+    """
+
+    fur: Array
+
+    def __len__(self) -> int:
+        """Number of bodies in a batch."""
+        return len(self.fur)
+
+    def bare(self) -> Self:
+        """The same body without limbs that not every animal shows."""
+        return self
+
+    def broadcast(self, n: int) -> Self:
+        """A batch (n,) of this one body, or this batch."""
+        if self.fur.shape == (n,):
+            return self
+        rows = {
+            name: np.broadcast_to(value, (n, *value.shape)).copy()
+            for name, value in vars(self).items()
+            if name not in self.SHARED
+        }
+        return replace(self, **rows)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
-class BodyShape:
+class BodyShape(Body):
     """The body around a tubular animal's mid-axis, one shape or a batch (...).
 
     Lengths in mm at scale 1.
@@ -36,7 +65,6 @@ class BodyShape:
         power: (...) of the superellipse across (2 is an ellipse).
         blobs: (..., B, 6) ellipsoids: station, left and up of the centre, radii forward, left, up.
         tail: (..., 3) length, radius at the rump, radius at the tip.
-        fur: (...) from 0 (sleek) to 1 (long and soft): how much a sensor loses at the outline.
     """
 
     half_width: Array
@@ -84,240 +112,400 @@ class BodyShape:
 
     def bare(self) -> BodyShape:
         """The same trunk without ears, feet and tail, for models of unknown limbs."""
-        return replace(self, blobs=_with_radii(self.blobs, 0.0), tail=np.zeros_like(self.tail))
-
-    def __len__(self) -> int:
-        """Number of shapes in a batch."""
-        return len(self.fur)
-
-    def __getitem__(self, index: int | slice | NDArray[np.int64]) -> BodyShape:
-        """One shape, or some, of a batch, by number, slice or row numbers."""
-        return BodyShape(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
-
-    def broadcast(self, n: int) -> BodyShape:
-        """A batch (n,) of this one shape, or this batch."""
-        if self.fur.ndim == 1 and len(self.fur) == n:
-            return self
-        return BodyShape(*(np.broadcast_to(a, (n, *a.shape)).copy() for a in vars(self).values()))
+        blobs = self.blobs.copy()
+        blobs[..., 3:] = 0.0
+        return replace(self, blobs=blobs, tail=np.zeros_like(self.tail))
 
 
-def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: int) -> BodyShape:
-    """Draw n animals of a family.
+# Body model of tapered capsules (sphere-swept segments) on a skeleton.
 
-    Args:
-        rng: random generator.
-        skeleton: one chain of joints, with stations in its [surface].
-        family: 'train' varies the default animal as mice vary; most of 'augmented' and all of
-            'wide' vary more than mice do, so that no forest relies on one exact profile; 'other'
-            has bodies of another build, which no forest is trained on.
-        n: animals.
 
-    Returns:
-        A batch (n,) of shapes.
+_KEYS = {"from", "to", "from_mm", "to_mm", "radii_mm"}
+PARTS = ("capsules", "beyond")
 
-    Raises:
-        LiexError: there is no such family.
+
+@dataclass(frozen=True)
+class Capsules(Body):
+    """C tapered capsules that move with a skeleton; one body, or a batch (n) of them.
+
+    Lengths in mm at scale 1. The first J - 1 capsules are the skeleton's bones, in order.
+
+    Attributes:
+        joints: (C, 2) int64, the joints that carry the two ends.
+        offsets: (..., C, 2, 3) mm, the ends in these joints' frames.
+        radii: (..., C, 2) mm at the ends.
     """
-    if family not in FAMILIES:
-        raise LiexError(f"there is no shape family '{family}'; choose one of {', '.join(FAMILIES)}")
-    default = BodyShape.default(skeleton)
+
+    SHARED = ("joints",)
+    joints: NDArray[np.int64]
+    offsets: Array
+    radii: Array
+    fur: Array = field(default_factory=lambda: np.array(0.0))
+
+    @staticmethod
+    def of(skeleton: Skeleton) -> Capsules:
+        """The body described by a skeleton's [surface]: radii_mm at the joints, and the list
+        [[surface.capsules]].
+
+        Raises:
+            LiexError: there is not one positive radius for each joint, or a capsule is invalid.
+        """
+        radii = np.array(skeleton.surface.get("radii_mm", []), float)
+        if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each "
+                f"of its {skeleton.n_joints} joints, or stations with half_width_mm and "
+                "half_height_mm"
+            )
+        bones = np.array(skeleton.edges, np.int64).reshape(-1, 2)
+        more = Capsules.listed(skeleton, PARTS[0])
+        return Capsules(
+            np.concatenate([bones, more.joints]),
+            np.concatenate([np.zeros((len(bones), 2, 3)), more.offsets]),
+            np.concatenate([radii[bones], more.radii]),
+        )
+
+    @staticmethod
+    def listed(skeleton: Skeleton, part: str) -> Capsules:
+        """The capsules of one of the lists in a skeleton's [surface].
+
+        Args:
+            skeleton: with its [surface] table.
+            part: 'capsules', which belong to the body, or 'beyond', possible extensions that do
+                not, such as an arm behind a hand.
+
+        Raises:
+            LiexError: an unknown key or joint, or a wrong number of values.
+        """
+        rows = [_parsed(table, skeleton, part) for table in skeleton.surface.get(part, [])]
+        return Capsules(
+            np.array([row[0] for row in rows], np.int64).reshape(-1, 2),
+            np.array([row[1] for row in rows], float).reshape(-1, 2, 3),
+            np.array([row[2] for row in rows], float).reshape(-1, 2),
+        )
+
+    @property
+    def faces(self) -> NDArray[np.int32]:
+        """Triangles (F, 3) int32 of the vertices returned by `vertices`."""
+        return skinning_kernels.joined_faces(
+            [(skinning_kernels.CAPSULE_RINGS, skinning_kernels.CAPSULE_SEGMENTS)] * len(self.joints)
+        )
+
+    def vertices(self, rotations: Array, positions: Array, scale: Array, girth: Array) -> Array:
+        """Mesh vertices in many poses.
+
+        Args:
+            rotations: (n, J, 3, 3) of the joints.
+            positions: (n, J, 3) mm of the joints.
+            scale: (n,) multiplies the offsets.
+            girth: (n,) multiplies the radii.
+
+        Returns:
+            (n, V, 3) mm, in the frame of the joints.
+        """
+        body = self.broadcast(len(positions))
+        per_capsule = skinning_kernels.CAPSULE_RINGS * skinning_kernels.CAPSULE_SEGMENTS + 2
+        out = np.empty((len(positions), per_capsule * len(self.joints), 3))
+        in_parallel(
+            skinning_kernels.skin_capsules,
+            len(positions),
+            rotations,
+            positions,
+            scale,
+            girth,
+            self.joints,
+            body.offsets,
+            body.radii,
+            out,
+        )
+        return out
+
+
+def _parsed(
+    table: Any, skeleton: Skeleton, part: str
+) -> tuple[list[int], list[list[float]], list[float]]:
+    """Joints, offsets and radii of one [[surface.capsules]] or [[surface.beyond]]."""
+    where = f"the [[surface.{part}]] of '{skeleton.name}'"
+    if not isinstance(table, dict) or not set(table) <= _KEYS:
+        raise LiexError(f"{where} have the keys {', '.join(sorted(_KEYS))}, got {table}")
+    names = [table.get("from"), table.get("to")]
+    for name in names:
+        if name not in skeleton.names:
+            raise LiexError(f"{where} connect two joints, but there is no joint {name!r}")
+    offsets = [table.get("from_mm", [0.0] * 3), table.get("to_mm", [0.0] * 3)]
+    radii = table.get("radii_mm", [])
+    if not (
+        _numbers(offsets[0], 3)
+        and _numbers(offsets[1], 3)
+        and _numbers(radii, 2)
+        and min(radii) > 0
+    ):
+        raise LiexError(
+            f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, "
+            f"got {table}"
+        )
+    return [skeleton.names.index(name) for name in names], offsets, radii
+
+
+def _numbers(value: Any, n: int) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) == n
+        and all(isinstance(x, int | float) for x in value)
+    )
+
+
+# Sphere-set approximation of a body: spheres along its bones that move with its joints.
+
+
+_SPACING = 1.3  # radii between the middles of two balls
+
+
+@dataclass(frozen=True)
+class Spheres:
+    """B spheres, each between two points that two joints carry. Lengths in mm at scale 1.
+
+    The first n_own spheres are the body; the others cover possible extensions that are not the
+    body, such as an arm behind a hand, where observations provide no evidence about it.
+
+    Attributes:
+        joints: (B, 2) int64, the joints that carry the two points.
+        offsets: (B, 2, 3) mm, the points in the joints' frames.
+        share: (B,) position of the centre on the line from the first point to the second.
+        radius: (B,) mm.
+        n_own: number of spheres of the body.
+    """
+
+    joints: NDArray[np.int64]
+    offsets: Array
+    share: Array
+    radius: Array
+    n_own: int
+
+    @property
+    def unit_mm(self) -> float:
+        """A tenth of the mean radius of the body's spheres at scale 1, mm: the unit of distances
+        from this body.
+        """
+        return float(self.radius[: self.n_own].mean()) / 10.0
+
+    @staticmethod
+    def of(skeleton: Skeleton) -> Spheres:
+        """Spheres along the capsules of a body, or along the chain of a tubular one.
+
+        Raises:
+            LiexError: the table describes neither capsules nor a tube.
+        """
+        if "stations" in skeleton.surface:
+            ends, offsets, radii = _tube(skeleton)
+        else:
+            body = Capsules.of(skeleton)
+            ends, offsets, radii = body.joints, body.offsets, body.radii
+        rows = _along(skeleton, ends, offsets, radii)
+        n_own = len(rows)
+        more = Capsules.listed(skeleton, PARTS[1])
+        rows += _along(skeleton, more.joints, more.offsets, more.radii)
+        return Spheres(
+            np.array([row[:2] for row in rows], np.int64),
+            np.array([row[2:4] for row in rows], float),
+            np.array([row[4] for row in rows], float),
+            np.array([row[5] for row in rows], float),
+            n_own,
+        )
+
+
+def _along(
+    skeleton: Skeleton, ends: NDArray[np.int64], offsets: Array, radii: Array
+) -> list[tuple[Any, ...]]:
+    """Spheres along capsules, spaced at home closely enough to form a body."""
+    home = Pose.home(skeleton).joints(skeleton)
+    rows = []
+    bones = {(p, j) for p, j in skeleton.edges}
+    for (a, b), (at_a, at_b), (first, last) in zip(ends, offsets, radii, strict=True):
+        length = float(np.linalg.norm(home[b] + at_b - home[a] - at_a))
+        is_bone = (
+            (int(a), int(b)) in bones and not np.any(at_a) and not np.any(at_b)
+        )  # it begins at the end of another capsule
+        n = max(1, round(length / (_SPACING * 0.5 * (first + last))))
+        rows += [
+            (a, b, at_a, at_b, s, first + s * (last - first))
+            for s in np.arange(int(is_bone), n + 1) / n
+        ]
+    return rows
+
+
+def _tube(skeleton: Skeleton) -> tuple[NDArray[np.int64], Array, Array]:
+    """Ends, offsets and radii of capsules that fill a tubular body, as thick as its smaller half
+    axis.
+    """
+    shape = BodyShape.default(skeleton)
     stations = np.array(skeleton.surface["stations"], float)
-    wild = (rng.random(n) < _WILD_SHARE) & (family == "augmented") | (family == "wide")
-    if family == "other":
-        width, height = _foreign(rng, default, stations, n)
-    else:
-        width, height = _varied(rng, default, stations, wild[:, None])
-    if family in ("augmented", "wide"):
-        free = wild & (rng.random(n) < _HULL_SHARE)
-        hull_width, hull_height = _hulls(rng, default, stations, n)
-        width = np.where(free[:, None], hull_width, width)
-        height = np.where(free[:, None], hull_height, height)
-    names = [pair["name"] for pair in skeleton.surface.get("pairs", []) for _ in range(2)]
-    blobs = np.broadcast_to(default.blobs, (n, *default.blobs.shape)).copy()
-    for b in range(len(names)):
-        # limbs stay on the body, however wide it is
-        station = default.blobs[b, 0]
-        k = int(np.argmin(np.abs(stations - station)))
-        blobs[:, b, 1] *= width[:, k] / default.half_width[k]
-        blobs[:, b, 2] *= height[:, k] / default.half_height[k]
-    for name in sorted(set(names)):
-        rows = [b for b, other in enumerate(names) if other == name]
-        _vary_pair(rng, blobs, rows, name, family, np.where(wild, 1.8, 1.2))
-    length = skeleton.length * rng.uniform(0.55, 0.95, n) * (rng.random(n) < 0.75)
-    tail = np.stack([length, rng.uniform(1.4, 2.6, n), rng.uniform(0.5, 1.1, n)], axis=-1)
-    return BodyShape(width, height, rng.uniform(1.9, 2.7, n), blobs, tail, rng.random(n))
+    half = np.minimum(shape.half_width, shape.half_height)
+    thick = np.interp(skeleton.reach / skeleton.length, stations, half)
+    thick = np.maximum(thick, 0.05 * thick.max())
+    bones = np.array(skeleton.edges, np.int64)
+    return bones, np.zeros((len(bones), 2, 3)), thick[bones]
 
 
-def draw_tail_bends(rng: np.random.Generator, n: int) -> Array:
-    """Bends of n tails: slow waves and small individual turns.
+# Linear blend skinning of a user's own triangle mesh.
 
-    Args:
-        rng: random generator.
-        n: tails.
 
-    Returns:
-        (n, TAIL_RINGS) rad, the turn at each ring.
+_BONES = 2  # bones per vertex
+_SHARPNESS = 4  # exponent of the distance in a bone's weight
+
+
+@dataclass(frozen=True)
+class MeshBody(Body):
+    """A mesh of V vertices that moves with a skeleton; one body, or a batch (n).
+
+    Lengths in mm at scale 1.
+
+    Attributes:
+        faces: (F, 3) int32.
+        bones: (V, B) int64, the joints that end the bones which a vertex follows.
+        carriers: (V, B) int64, the joints that begin them and carry them.
+        weight: (V, B), of sum 1.
+        along: (V, B, 3) mm, the vertex in the frame that carries the bone: the part along the bone.
+        across: (V, B, 3) mm, the part across it.
+        width: (..., J), the girth at each joint over the file's.
     """
-    ring = np.arange(TAIL_RINGS) / TAIL_RINGS
-    first, second = rng.normal(0.0, 0.12, (2, n, 1))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1))
-    bends = (
-        first + second * np.sin(2.0 * np.pi * ring + phase) + rng.normal(0.0, 0.04, (n, TAIL_RINGS))
-    )
-    bends[:, 0] += rng.normal(0.0, 0.35, n)
-    return bends
 
+    SHARED = ("faces", "bones", "carriers", "weight", "along", "across")
+    faces: NDArray[np.int32]
+    bones: NDArray[np.int64]
+    carriers: NDArray[np.int64]
+    weight: Array
+    along: Array
+    across: Array
+    width: Array
+    fur: Array = field(default_factory=lambda: np.array(0.0))
 
-def _bump(stations: Array, centre: Array, spread: float) -> Array:
-    """A bell (n, R) of height 1 around `centre` (n, 1) along the stations (R,)."""
-    return np.exp(-(((stations - centre) / spread) ** 2))
+    @staticmethod
+    def of(skeleton: Skeleton) -> MeshBody:
+        """The mesh of a skeleton's [surface] table, with vertices_mm and faces, bound to the
+        nearest bones at home.
 
-
-def _varied(
-    rng: np.random.Generator, default: BodyShape, stations: Array, wild: NDArray[np.bool_]
-) -> tuple[Array, Array]:
-    """Half widths and heights (n, R): the default profile, made fatter, blunter, ... by smooth
-    factors.
-
-    wild (n, 1): animals outside the range of mice, with ranges twice as wide and additional waves.
-    """
-    n = len(wild)
-
-    def draw(low: float, high: float) -> Array:
-        half = 0.5 * (high - low) * np.where(wild, 2.0, 1.0)
-        return 0.5 * (low + high) + half * rng.uniform(-1.0, 1.0, (n, 1))
-
-    read = _reread(stations, np.exp(draw(-0.35, 0.35)), np.exp(draw(-0.45, 0.35)))
-    width = np.interp(read, stations, default.half_width)
-    height = np.interp(read, stations, default.half_height)
-    girth = np.exp(draw(np.log(0.8), np.log(1.25)))
-    # below 1 the body is more of a cylinder with a broad head, above 1 more of a drop
-    drop = np.where(wild, np.exp(draw(-0.32, 0.15)), 1.0)
-    width = default.half_width.max() * (width / default.half_width.max()) ** drop
-    height = default.half_height.max() * (height / default.half_height.max()) ** drop
-    belly = draw(-0.08, 0.28) * _bump(stations, draw(0.10, 0.50), 0.18)
-    neck = 1.0 - draw(-0.03, 0.20) * _bump(stations, np.full((n, 1), 0.70), 0.07)
-    head = 1.0 + draw(-0.15, 0.20) / (1.0 + np.exp(-(stations - 0.74) / 0.03))
-    hunch = 1.0 + draw(-0.10, 0.20) * _bump(stations, draw(0.15, 0.45), 0.20)
-    width = width * np.where(wild, _waves(rng, stations, n, 0.10), 1.0)
-    height = height * np.where(wild, _waves(rng, stations, n, 0.07), 1.0)
-    width = width * girth * draw(0.90, 1.10) * (1.0 + belly) * neck * head
-    height = height * girth * draw(0.88, 1.12) * (1.0 + 0.5 * belly) * np.sqrt(neck) * head * hunch
-    return width, height
-
-
-def _hulls(
-    rng: np.random.Generator, default: BodyShape, stations: Array, n: int
-) -> tuple[Array, Array]:
-    """Half widths and heights (n, R) of bodies independent of the default profile.
-
-    Any smooth closed outline whose rear is broader than its snout, with a waist, a neck, both or
-    neither: monotone cubic interpolation (PCHIP) of its square through random knots.
-    """
-    from scipy.interpolate import PchipInterpolator
-
-    u = (stations - stations[0]) / (stations[-1] - stations[0])
-    knots = np.array([0.0, 0.06, 0.18, 0.32, 0.46, 0.60, 0.72, 0.82, 0.92, 1.0])
-    low = np.array([0.0, 0.30, 0.65, 0.80, 0.75, 0.60, 0.45, 0.35, 0.18, 0.0])
-    high = np.array([0.0, 0.75, 1.00, 1.05, 1.05, 1.05, 1.00, 0.85, 0.55, 0.0])
-    # one draw for the whole body and one for each position: fat noses and necks are correlated
-    whole = rng.random((n, 1))
-    share = np.clip(0.6 * whole + 0.4 * rng.random((n, len(knots))), 0.0, 1.0)
-    # squares are interpolated, so that both ends are round as those of an ellipse
-    outline = (
-        np.maximum(PchipInterpolator(knots, (low + share * (high - low)) ** 2, axis=1)(u), 0.0)
-        ** 0.5
-    )
-    outline /= outline.max(axis=1, keepdims=True)
-    width = (
-        default.half_width.max() * np.exp(rng.uniform(np.log(0.65), np.log(1.4), (n, 1))) * outline
-    )
-    ratio = default.half_height.max() / default.half_width.max() * rng.uniform(0.75, 1.2, (n, 1))
-    return width, width * ratio * _waves(rng, stations, n, 0.05)
-
-
-def _reread(stations: Array, snout: Array, rump: Array) -> Array:
-    """Positions (n, R) on the default profile to sample for each station: powers above 1 make a fat
-    snout or a thin rump.
-    """
-    low = stations[0]
-    high = 0.10
-    rear = low + (high - low) * np.clip((stations - low) / (high - low), 0.0, 1.0) ** rump
-    front = 0.70 + 0.30 * np.clip((stations - 0.70) / 0.30, 0.0, 1.0) ** snout
-    return np.where(stations < high, rear, np.where(stations > 0.70, front, stations))
-
-
-def _waves(rng: np.random.Generator, stations: Array, n: int, sd: float) -> Array:
-    """Factors (n, R) around 1 that vary slowly by about `sd` along the body."""
-    total = np.zeros((n, len(stations)))
-    for cycles in (0.5, 1.0, 1.5, 2.0):
-        phase = rng.uniform(0.0, 2.0 * np.pi, (n, 1))
-        total += rng.normal(0.0, sd / np.sqrt(2.0), (n, 1)) * np.sin(
-            2.0 * np.pi * cycles * stations + phase
+        Raises:
+            LiexError: vertices or faces are not finite triples, or a face refers to a missing
+                vertex.
+        """
+        table = skeleton.surface
+        vertices = np.array(table["vertices_mm"], float)
+        faces = np.array(table["faces"], np.int64)
+        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.isfinite(vertices).all():
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' needs vertices_mm, finite triples of mm"
+            )
+        if (
+            faces.ndim != 2
+            or faces.shape[1:] != (3,)
+            or faces.min() < 0
+            or faces.max() >= len(vertices)
+        ):
+            raise LiexError(
+                f"the [surface] of '{skeleton.name}' needs faces, triples of numbers of its "
+                "vertices"
+            )
+        home = Pose.home(skeleton).frames(skeleton)
+        ends = np.arange(1, skeleton.n_joints)
+        carriers = skeleton.parents[ends]
+        start = home.translation[carriers]
+        stop = home.translation[ends]
+        bone = stop - start
+        length2 = np.maximum(np.sum(bone**2, axis=-1), 1e-12)
+        share = np.clip(
+            np.einsum("vbd,bd->vb", vertices[:, None] - start, bone) / length2, 0.0, 1.0
         )
-    return np.exp(total)
-
-
-def _foreign(
-    rng: np.random.Generator, default: BodyShape, stations: Array, n: int
-) -> tuple[Array, Array]:
-    """Half widths and heights (n, R) of builds that are not in 'train'.
-
-    Every mouse is blunt behind and pointed in front; nothing else is shared with 'train'. Half of
-    them are long and slim and widest at the shoulders: a blunt rump, a flank that widens forward in
-    a straight line, then a cone to the nose. The other half are obese: an egg without a neck that
-    ends in a short cone of a snout.
-    """
-    u = (stations - stations[0]) / (stations[-1] - stations[0])
-    shoulder = rng.uniform(0.42, 0.55, (n, 1))
-    rear = rng.uniform(0.72, 0.92, (n, 1))
-    blunt = np.clip(u / 0.12, 0.0, 1.0) ** 0.5
-    flank = rear + (1.0 - rear) * np.clip(u / shoulder, 0.0, 1.0)
-    cone = np.clip((1.0 - u) / (1.0 - shoulder), 0.0, 1.0) ** rng.uniform(0.65, 0.9, (n, 1))
-    slim = blunt * flank * cone
-    power = rng.uniform(2.2, 3.0, (n, 1))
-    warp = rng.uniform(0.75, 1.05, (n, 1))
-    egg = np.maximum(1.0 - np.abs(2.0 * u**warp - 1.0) ** power, 0.0) ** (1.0 / power)
-    egg = egg * np.clip((1.0 - u) / rng.uniform(0.28, 0.42, (n, 1)), 0.0, 1.0) ** 0.75
-    obese = rng.random((n, 1)) < 0.5
-    widest = default.half_width.max() * np.where(
-        obese, rng.uniform(1.15, 1.38, (n, 1)), rng.uniform(0.66, 0.88, (n, 1))
-    )
-    flat = np.where(obese, rng.uniform(0.78, 0.95, (n, 1)), rng.uniform(0.90, 1.15, (n, 1)))
-    width = widest * np.where(obese, egg, slim)
-    return width, width * flat
-
-
-def _vary_pair(
-    rng: np.random.Generator,
-    blobs: Array,
-    rows: list[int],
-    name: str,
-    family: str,
-    largest_ear: Array,
-) -> None:
-    """Ears and feet with varied size, position and presence, the same on both sides."""
-    n = len(blobs)
-    if name == "ear":
-        size = rng.uniform(1.25, 1.7, n) if family == "other" else rng.uniform(0.6, largest_ear)
-        present = rng.random(n) < (1.0 if family == "other" else 0.65)
-        factors = np.stack(
-            [rng.uniform(0.7, 1.6, n), rng.uniform(0.8, 1.1, n), rng.uniform(0.45, 1.1, n)], axis=-1
+        far = np.linalg.norm(vertices[:, None] - start - share[..., None] * bone, axis=-1)
+        n_bones = min(_BONES, len(ends))
+        near = np.argsort(far, axis=1, kind="stable")[:, :n_bones]
+        pull = 1.0 / np.maximum(np.take_along_axis(far, near, axis=1), 1e-6) ** _SHARPNESS
+        carrier = carriers[near]
+        local = np.einsum(
+            "vbji,vbj->vbi", home.rotation[carrier], vertices[:, None] - home.translation[carrier]
         )
-    else:
-        size = rng.uniform(0.7, 1.3, n)
-        present = rng.random(n) < 0.6
-        factors = rng.uniform(0.85, 1.15, (n, 3))
-    spread = rng.uniform(0.85, 1.2, n)
-    lift = rng.uniform(0.85, 1.1, n)
-    for b in rows:
-        blobs[:, b, 1] *= spread
-        blobs[:, b, 2] *= lift
-        blobs[:, b, 3:] *= (size * present)[:, None] * factors
+        direction = skeleton.offsets[ends] / np.sqrt(length2)[:, None]
+        along = np.einsum("vbi,vbi->vb", local, direction[near])[..., None] * direction[near]
+        return MeshBody(
+            faces.astype(np.int32),
+            ends[near],
+            carrier,
+            pull / pull.sum(axis=1, keepdims=True),
+            along,
+            local - along,
+            np.ones(skeleton.n_joints),
+        )
+
+    def vertices(self, rotations: Array, positions: Array, scale: Array, girth: Array) -> Array:
+        """Mesh vertices in many poses.
+
+        Args:
+            rotations: (n, J, 3, 3) of the joints.
+            positions: (n, J, 3) mm of the joints.
+            scale: (n,) multiplies lengths along the bones.
+            girth: (n,) multiplies lengths across the bones.
+
+        Returns:
+            (n, V, 3) mm, in the frame of the joints.
+        """
+        n = len(positions)
+        body = self.broadcast(n)
+        check_shapes(
+            "a mesh's poses",
+            ("rotations", rotations, (n, "J", 3, 3)),
+            ("positions", positions, (n, "J", 3)),
+            ("scale", scale, (n,)),
+            ("girth", girth, (n,)),
+            ("width", body.width, (n, "J")),
+        )
+        check_index("the skeleton's joints", self.bones, positions.shape[1])
+        out = np.empty((n, len(self.weight), 3))
+        in_parallel(
+            _skin_mesh,
+            n,
+            rotations,
+            positions,
+            scale,
+            girth,
+            _Skin(self.carriers, self.bones, self.weight, self.along, self.across),
+            body.width,
+            out,
+        )
+        return out
 
 
-def _with_radii(blobs: Array, factor: float) -> Array:
-    """Blobs with their radii multiplied."""
-    scaled = blobs.copy()
-    scaled[..., 3:] *= factor
-    return scaled
+class _Skin(NamedTuple):
+    """How V vertices follow their B bones, see `MeshBody`.
+
+    Attributes:
+        carrier: (V, B) the joints that carry the bones.
+        bones: (V, B) the joints that end them.
+        weight: (V, B).
+        along: (V, B, 3) mm.
+        across: (V, B, 3) mm.
+    """
+
+    carrier: Any
+    bones: Any
+    weight: Any
+    along: Any
+    across: Any
+
+
+@kernel(nogil=True)
+def _skin_mesh(rotations, positions, scale, girth, skin, width, out, start, stop):
+    """Linear blend skinning of a batch into out (n, V, 3)."""
+    for i in range(start, stop):
+        for v in range(len(skin.weight)):
+            for axis in range(3):
+                out[i, v, axis] = 0.0
+            for b in range(skin.weight.shape[1]):
+                j = skin.carrier[v, b]
+                thick = girth[i] * 0.5 * (width[i, j] + width[i, skin.bones[v, b]])
+                for axis in range(3):
+                    total = positions[i, j, axis]
+                    for k in range(3):
+                        total += rotations[i, j, axis, k] * (
+                            scale[i] * skin.along[v, b, k] + thick * skin.across[v, b, k]
+                        )
+                    out[i, v, axis] += skin.weight[v, b] * total

@@ -87,16 +87,13 @@ class CameraView:
                 raise LiexError(
                     f"{origin}: [view] has an unknown key '{key}'; use {', '.join(keys)}"
                 )
-        frame = table.get("frame", VIEWS[0])
+        for key, choices in (("foreground", FOREGROUNDS), ("frame", VIEWS)):
+            value = table.get(key, choices[0])
+            if value not in choices:
+                raise LiexError(
+                    f"{origin}: [view] {key} is one of {', '.join(choices)}, got {value!r}"
+                )
         area = table.get("area", list(_AREA))
-        foreground = table.get("foreground", FOREGROUNDS[0])
-        if foreground not in FOREGROUNDS:
-            raise LiexError(
-                f"{origin}: [view] foreground is one of {', '.join(FOREGROUNDS)}, got "
-                f"{foreground!r}"
-            )
-        if frame not in VIEWS:
-            raise LiexError(f"{origin}: [view] frame is one of {', '.join(VIEWS)}, got {frame!r}")
         if not (
             isinstance(area, list)
             and [_is_number(a) for a in area] == [True, True]
@@ -116,9 +113,8 @@ class CameraView:
             if not (_is_number(value) and value > 0):
                 raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
             lengths[key] = float(value)
-        return CameraView(
-            frame=frame, area=(float(area[0]), float(area[1])), foreground=foreground, **lengths
-        )
+        stated = {key: table[key] for key in ("frame", "foreground") if key in table}
+        return CameraView(area=(float(area[0]), float(area[1])), **stated, **lengths)
 
 
 MOUSE_VIEW = CameraView()
@@ -206,38 +202,37 @@ class Skeleton:
             raise LiexError(f"{origin}: a skeleton needs a name and at least one [[joints]] table")
         if not isinstance(surface, dict):
             raise LiexError(f"{origin}: [surface] is a table, got {surface!r}")
-        rows = [_Joint.parse(joint, k, origin) for k, joint in enumerate(joints)]
-        names = [row.name for row in rows]
-        parents = []
-        for k, row in enumerate(rows):
-            if k == 0 and row.parent:
+        rows = [_parsed_joint(joint, k, origin) for k, joint in enumerate(joints)]
+        names, named_parents, offset, rest, free, limits_deg = zip(*rows, strict=True)
+        if named_parents[0]:
+            raise LiexError(
+                f"{origin}: the first joint is the base and has no parent, got '{named_parents[0]}'"
+            )
+        for k, parent in enumerate(named_parents[1:], start=1):
+            if parent not in names[:k]:
                 raise LiexError(
-                    f"{origin}: the first joint is the base and has no parent, got '{row.parent}'"
-                )
-            if k > 0 and row.parent not in names[:k]:
-                raise LiexError(
-                    f"{origin}: the parent '{row.parent}' of '{row.name}' must be a joint listed "
+                    f"{origin}: the parent '{parent}' of '{names[k]}' must be a joint listed "
                     "before it"
                 )
-            parents.append(names.index(row.parent) if k else -1)
+        parents = [-1, *(names.index(parent) for parent in named_parents[1:])]
         if len(set(names)) != len(names):
             raise LiexError(f"{origin}: two joints have the same name; every joint needs its own")
-        axes = np.array([row.axes for row in rows], bool)
+        axes = np.array(free, bool)
         axes[0] = True
-        offsets = np.array([row.offset for row in rows], float)
-        relative_size = _relative_size(parents, offsets)
+        offsets = np.array(offset, float)
+        relative_size = round(float(_reach(parents, offsets).max()) / REFERENCE_MM, 6)
         if not 0.0 < relative_size < math.inf:
             raise LiexError(
                 f"{origin}: a skeleton needs a second joint at some distance from the first one"
             )
         return Skeleton(
             name=table["name"],
-            names=tuple(names),
+            names=names,
             parents=np.array(parents, np.int64),
             offsets=offsets,
-            rest=so3.exp(np.radians([row.rest for row in rows])),
+            rest=so3.exp(np.radians(rest)),
             axes=axes,
-            limits=np.radians([row.limits for row in rows]),
+            limits=np.radians(limits_deg),
             surface=surface,
             view=CameraView.from_table(table.get("view", {}), relative_size, origin),
             table=table,
@@ -264,17 +259,22 @@ class Skeleton:
         return [(int(p), j) for j, p in enumerate(self.parents) if p >= 0]
 
     @cached_property
+    def reach(self) -> Array:
+        """Lengths (J,) of the paths from the base to each joint at home, mm."""
+        return _reach(self.parents, self.offsets)
+
+    @cached_property
     def length(self) -> float:
         """Length of the longest path from the base at home, mm.
 
         The spine of a mouse, the body of a fish.
         """
-        return _length(self.parents, self.offsets)
+        return float(self.reach.max())
 
     @cached_property
     def relative_size(self) -> float:
         """Home length over REFERENCE_MM, to six digits: 1 for the mouse."""
-        return _relative_size(self.parents, self.offsets)
+        return round(self.length / REFERENCE_MM, 6)
 
     @cached_property
     def next_joint(self) -> NDArray[np.int64]:
@@ -317,67 +317,52 @@ def _with_mesh(table: dict[str, Any], path: Path) -> dict[str, Any]:
     return table | {"surface": others | read_mesh(path.parent / name, float(unit_mm), str(path))}
 
 
-def _length(parents: Sequence[int] | NDArray[np.int64], offsets: Array) -> float:
-    """Length of the longest chain from the base, mm."""
+def _reach(parents: Sequence[int] | NDArray[np.int64], offsets: Array) -> Array:
+    """Lengths (J,) of the chains from the base to each joint, mm."""
     reach = np.zeros(len(offsets))
     for child in range(1, len(offsets)):
         reach[child] = reach[parents[child]] + np.linalg.norm(offsets[child])
-    return float(reach.max())
-
-
-def _relative_size(parents: Sequence[int] | NDArray[np.int64], offsets: Array) -> float:
-    return round(_length(parents, offsets) / REFERENCE_MM, 6)
+    return reach
 
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _HUGE
 
 
-@dataclass(frozen=True)
-class _Joint:
-    """One validated [[joints]] table."""
+_Joint = tuple[str, str, list[float], list[float], list[bool], list[list[float]]]
 
-    name: str
-    parent: str
-    offset: list[float]
-    rest: list[float]
-    axes: list[bool]
-    limits: list[list[float]]
 
-    @staticmethod
-    def parse(table: dict[str, Any], index: int, origin: str) -> _Joint:
-        name = table.get("name") if isinstance(table, dict) else None
-        if not isinstance(name, str):
-            raise LiexError(f"{origin}: joint {index} has no name")
-        where = f"{origin}: joint '{name}'"
-        for key in table:
-            if key not in _JOINT_KEYS:
-                raise LiexError(
-                    f"{where} has an unknown key '{key}'; use {', '.join(sorted(_JOINT_KEYS))}"
-                )
-        axes = table.get("axes", [])
-        if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
-            raise LiexError(f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}")
-        limits_deg = table.get("limits_deg", {})
-        usual = {axis: [-180.0, 180.0] if axis in axes else [0.0, 0.0] for axis in AXES}
-        limits = (
-            [limits_deg.get(axis, usual[axis]) for axis in AXES]
-            if isinstance(limits_deg, dict)
-            else []
-        )
-        if len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits):
+def _parsed_joint(table: dict[str, Any], index: int, origin: str) -> _Joint:
+    """Name, parent, offset mm, rest deg, axes and limits deg of one [[joints]] table."""
+    name = table.get("name") if isinstance(table, dict) else None
+    if not isinstance(name, str):
+        raise LiexError(f"{origin}: joint {index} has no name")
+    where = f"{origin}: joint '{name}'"
+    for key in table:
+        if key not in _JOINT_KEYS:
             raise LiexError(
-                f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got "
-                f"{limits_deg}"
+                f"{where} has an unknown key '{key}'; use {', '.join(sorted(_JOINT_KEYS))}"
             )
-        return _Joint(
-            name,
-            table.get("parent", ""),
-            _triple(table.get("offset_mm", [0.0, 0.0, 0.0]), f"{where}: offset_mm"),
-            _triple(table.get("rest_deg", [0.0, 0.0, 0.0]), f"{where}: rest_deg"),
-            [axis in axes for axis in AXES],
-            limits,
+    axes = table.get("axes", [])
+    if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
+        raise LiexError(f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}")
+    limits_deg = table.get("limits_deg", {})
+    usual = {axis: [-180.0, 180.0] if axis in axes else [0.0, 0.0] for axis in AXES}
+    limits = (
+        [limits_deg.get(axis, usual[axis]) for axis in AXES] if isinstance(limits_deg, dict) else []
+    )
+    if len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits):
+        raise LiexError(
+            f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}"
         )
+    return (
+        name,
+        table.get("parent", ""),
+        _triple(table.get("offset_mm", [0.0, 0.0, 0.0]), f"{where}: offset_mm"),
+        _triple(table.get("rest_deg", [0.0, 0.0, 0.0]), f"{where}: rest_deg"),
+        [axis in axes for axis in AXES],
+        limits,
+    )
 
 
 def _is_range(pair: Any) -> bool:

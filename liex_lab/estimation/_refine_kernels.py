@@ -141,7 +141,7 @@ def crop_pixel(packed_camera, p):
 
 @kernel()
 def forward(tree, root_rotation, root_position, angles, scale, rotations, positions):
-    """Forward kinematics of one pose, as `body.kinematics.forward_kinematics`.
+    """Forward kinematics of one pose, as `body.pose.forward_kinematics`.
 
     Args:
         tree: the kinematic tree.

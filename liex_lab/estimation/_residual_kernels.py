@@ -4,7 +4,7 @@ Together with the features of the learned metric, these numbers separate good fr
 (ours). They measure readings that the posed body does not explain, and parts of the body that
 contradict the readings: signed distances d = |x - c| - r of depth readings x from the nearest
 sphere, and of the spheres' fronts from the readings under them. The body is that of
-`body.capsules.Spheres`.
+`body.shape.Spheres`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _STRIDE = 6  # step between inspected crop pixels
 
 
 class SphereModel(NamedTuple):
-    """The sphere model compared with the height map, see `body.capsules.Spheres`; may be empty.
+    """The sphere model compared with the height map, see `body.shape.Spheres`; may be empty.
 
     Attributes:
         unit_mm: a tenth of the usual radius at scale 1, mm.

@@ -21,8 +21,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.capsules import Spheres
-from liex_lab.body.kinematics import KinematicTree, aim
+from liex_lab.body.pose import KinematicTree, aim
+from liex_lab.body.shape import Spheres
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.kinematics import KinematicTree
+from liex_lab.body.pose import KinematicTree
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError, ModelError

@@ -38,9 +38,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.capsules import Spheres
-from liex_lab.body.kinematics import KinematicTree
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import KinematicTree, Pose
+from liex_lab.body.shape import Spheres
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as feature_kernels
 from liex_lab.estimation import _refine_kernels as kernels

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface, joint_reaches
+from liex_lab.body.surface import Surface
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.refine import ridge_regression
 from liex_lab.geometry import SE3
@@ -71,7 +71,7 @@ def cross_sections(
     """
     joints = pose.joints(skeleton)
     n = len(joints)
-    ends = joint_reaches(skeleton)
+    ends = skeleton.reach / skeleton.length
     at = np.linspace(_FROM, _TO, N_STATIONS)
     bone = np.clip(np.searchsorted(ends, at, side="right") - 1, 0, len(ends) - 2)
     share = ((at - ends[bone]) / (ends[bone + 1] - ends[bone]))[:, None]
@@ -329,14 +329,14 @@ def built(
         places: (P,) along the body, shares of its length, ascending.
     """
     average = Surface.of(skeleton)
-    assert average.shape is not None
     wide, high = (
         np.exp(np.interp(average.stations, places, np.log(factor))) for factor in (width, height)
     )
-    shape = average.shape
+    shape = average.body
+    assert isinstance(shape, BodyShape)
     return replace(
         average,
-        shape=replace(
+        body=replace(
             shape, half_width=shape.half_width * wide, half_height=shape.half_height * high
         ),
     )

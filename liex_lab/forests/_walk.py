@@ -41,112 +41,142 @@ def _mask(indices: list[int]) -> str:
     return f"<{len(indices)} x i32> <" + ", ".join(f"i32 {i}" for i in indices) + ">"
 
 
+_ZEROS = f"<{LANES} x i32> zeroinitializer"
+_SMIN = f"@llvm.smin.v{LANES}i32"
+_SMAX = f"@llvm.smax.v{LANES}i32"
+_ANY = f"@llvm.vector.reduce.or.v{LANES}i1"
+# the joint's crop pixel plus one half, for rounding
+_MIDDLE = f"""
+    %middle_u = fadd {_FLOATS} %view0, {_same("float", "0.5")}
+    %middle_v = fadd {_FLOATS} %view1, {_same("float", "0.5")}
+"""
+_FUNCTION = f"""
+declare {_INTS} {_SMIN}({_INTS}, {_INTS})
+declare {_INTS} {_SMAX}({_INTS}, {_INTS})
+declare i1 {_ANY}({_BITS})
+define weak_odr void @{{name}}(ptr noalias %nodes, i32 %root, ptr noalias %pixels,
+    ptr noalias %base, ptr noalias %scalar_base, ptr noalias %inverse, ptr noalias %views,
+    i64 %stride, i32 %side, ptr noalias %leaf, i64 %first) noinline {{{{
+entry:
+{{body}}
+done:
+  %leaves = xor {_INTS} %word2, {_same("i32", -1)}
+  %out = getelementptr i32, ptr %leaf, i64 %first
+  store {_INTS} %leaves, ptr %out, align 4
+  ret void
+}}}}
+"""
+
+
 class _Text:
-    """LLVM code under construction; a call appends one line."""
+    """LLVM code under construction; a call appends lines."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
 
-    def __call__(self, line: str) -> None:
-        self.lines.append("  " + line)
+    def __call__(self, block: str) -> None:
+        self.lines += ["  " + line.strip() for line in block.strip().splitlines()]
 
     def spread(self, name: str, type_: str, value: str) -> None:
         """A scalar in all lanes of %name."""
         vector = _INTS if type_ == "i32" else _FLOATS
-        self(f"%{name}.one = insertelement {vector} undef, {type_} {value}, i32 0")
-        self(
-            f"%{name} = shufflevector {vector} %{name}.one, {vector} undef, <{LANES} x i32> "
-            "zeroinitializer"
-        )
+        self(f"""
+            %{name}.one = insertelement {vector} undef, {type_} {value}, i32 0
+            %{name} = shufflevector {vector} %{name}.one, {vector} undef, {_ZEROS}
+        """)
 
     def joined(self, names: list[str], type_: str, width: int) -> list[str]:
         """The rows %names of `width` elements each, joined two by two until rows are LANES or more
-        long.
+        elements wide.
         """
         while width < LANES:
-            pairs = [f"{names[i]}.{width}" for i in range(0, len(names), 2)]
-            for i, pair in enumerate(pairs):
-                first = names[2 * i]
-                second = names[2 * i + 1]
-                self(
-                    f"%{pair} = shufflevector <{width} x {type_}> %{first}, <{width} x {type_}> "
-                    f"%{second}, {_mask(list(range(2 * width)))}"
-                )
+            pairs = []
+            row = f"<{width} x {type_}>"
+            mask = _mask(list(range(2 * width)))
+            for first, second in zip(names[::2], names[1::2], strict=True):
+                pairs.append(f"{first}.{width}")
+                self(f"%{pairs[-1]} = shufflevector {row} %{first}, {row} %{second}, {mask}")
             names = pairs
             width = 2 * width
         return names
 
     def column(self, name: str, rows: list[str], type_: str, width: int, index: int) -> None:
         """%name: element `index` of every lane's record, from rows of LANES / width records of that
-        width each.
+        width.
         """
         each = LANES // width
+        vector = f"<{LANES} x {type_}>"
+        picked = [width * r + index for r in range(each)]
+        mask = _mask(picked + [LANES + p for p in picked])
         parts = []
         for i in range(0, len(rows), 2):
-            part = f"{name}.p{i}"
-            picked = [width * r + index for r in range(each)]
+            parts.append(f"{name}.p{i}")
             self(
-                f"%{part} = shufflevector <{LANES} x {type_}> %{rows[i]}, <{LANES} x {type_}> "
-                f"%{rows[i + 1]}, {_mask(picked + [LANES + p for p in picked])}"
+                f"%{parts[-1]} = shufflevector {vector} %{rows[i]}, {vector} %{rows[i + 1]}, {mask}"
             )
-            parts.append(part)
         last = self.joined(parts, type_, 2 * each)[0]
-        self(f"%{name} = bitcast <{LANES} x {type_}> %{last} to <{LANES} x {type_}>")
+        self(f"%{name} = bitcast {vector} %{last} to {vector}")
 
     def signed_byte(self, name: str, word: str, index: int) -> None:
         """%name: byte `index` of the word, as float."""
-        if index < 3:
-            self(f"%{name}.up = shl {_INTS} %{word}, {_same('i32', 24 - 8 * index)}")
-        source = f"{name}.up" if index < 3 else word
-        self(f"%{name}.int = ashr {_INTS} %{source}, {_same('i32', 24)}")
-        self(f"%{name} = sitofp {_INTS} %{name}.int to {_FLOATS}")
+        self(f"""
+            %{name}.up = shl {_INTS} %{word}, {_same("i32", 24 - 8 * index)}
+            %{name}.int = ashr {_INTS} %{name}.up, {_same("i32", 24)}
+            %{name} = sitofp {_INTS} %{name}.int to {_FLOATS}
+        """)
 
     def pixel_of(self, name: str, offsets: list[str]) -> None:
         """%name: index in `pixels` of the probe under an offset."""
         for axis, start, first in (("column", "middle_u", 2), ("row", "middle_v", 5)):
+            at = f"{name}.{axis}"
             total = start
             for i, offset in enumerate(offsets):
-                self(f"%{name}.{axis}.m{i} = fmul {_FLOATS} %view{first + i}, %{offset}")
-                self(f"%{name}.{axis}.s{i} = fadd {_FLOATS} %{total}, %{name}.{axis}.m{i}")
-                total = f"{name}.{axis}.s{i}"
-            self(f"%{name}.{axis}.int = fptosi {_FLOATS} %{total} to {_INTS}")
-            self(
-                f"%{name}.{axis}.low = call {_INTS} @llvm.smax.v{LANES}i32({_INTS} "
-                f"%{name}.{axis}.int, {_INTS} zeroinitializer)"
-            )
-            self(
-                f"%{name}.{axis} = call {_INTS} @llvm.smin.v{LANES}i32({_INTS} %{name}.{axis}.low, "
-                f"{_INTS} %limit)"
-            )
-        self(f"%{name}.line = mul {_INTS} %{name}.row, %sides")
-        self(f"%{name}.in = add {_INTS} %{name}.line, %{name}.column")
-        self(f"%{name} = add {_INTS} %{name}.in, %map")
+                self(f"""
+                    %{at}.m{i} = fmul {_FLOATS} %view{first + i}, %{offset}
+                    %{at}.s{i} = fadd {_FLOATS} %{total}, %{at}.m{i}
+                """)
+                total = f"{at}.s{i}"
+            self(f"""
+                %{at}.int = fptosi {_FLOATS} %{total} to {_INTS}
+                %{at}.low = call {_INTS} {_SMAX}({_INTS} %{at}.int, {_INTS} zeroinitializer)
+                %{at} = call {_INTS} {_SMIN}({_INTS} %{at}.low, {_INTS} %limit)
+            """)
+        self(f"""
+            %{name}.line = mul {_INTS} %{name}.row, %sides
+            %{name}.in = add {_INTS} %{name}.line, %{name}.column
+            %{name} = add {_INTS} %{name}.in, %map
+        """)
 
     def read(self, name: str, index: str) -> None:
         """%name: the pixels at an index, as float. One by one, as gathers are no faster and rarely
         available.
         """
+        shorts = f"<{LANES} x i16>"
         before = "undef"
         for k in range(LANES):
-            self(f"%{name}.i{k} = extractelement {_INTS} %{index}, i32 {k}")
-            self(f"%{name}.w{k} = zext i32 %{name}.i{k} to i64")
-            self(f"%{name}.a{k} = getelementptr i16, ptr %pixels, i64 %{name}.w{k}")
-            self(f"%{name}.v{k} = load i16, ptr %{name}.a{k}, align 2")
-            self(
-                f"%{name}.r{k} = insertelement <{LANES} x i16> {before}, i16 %{name}.v{k}, i32 {k}"
-            )
+            self(f"""
+                %{name}.i{k} = extractelement {_INTS} %{index}, i32 {k}
+                %{name}.w{k} = zext i32 %{name}.i{k} to i64
+                %{name}.a{k} = getelementptr i16, ptr %pixels, i64 %{name}.w{k}
+                %{name}.v{k} = load i16, ptr %{name}.a{k}, align 2
+                %{name}.r{k} = insertelement {shorts} {before}, i16 %{name}.v{k}, i32 {k}
+            """)
             before = f"%{name}.r{k}"
-        self(f"%{name}.int = sext <{LANES} x i16> {before} to {_INTS}")
-        self(f"%{name} = sitofp {_INTS} %{name}.int to {_FLOATS}")
+        self(f"""
+            %{name}.int = sext {shorts} {before} to {_INTS}
+            %{name} = sitofp {_INTS} %{name}.int to {_FLOATS}
+        """)
 
 
 def _load_nodes(text: _Text) -> None:
     """%word0 .. %word3 of each lane's node."""
     for k in range(LANES):
-        text(f"%at{k} = extractelement {_INTS} %at, i32 {k}")
-        text(f"%wide{k} = zext i32 %at{k} to i64")
-        text(f"%where{k} = getelementptr <4 x i32>, ptr %nodes, i64 %wide{k}")
-        text(f"%node{k} = load <4 x i32>, ptr %where{k}, align 4")
+        text(f"""
+            %at{k} = extractelement {_INTS} %at, i32 {k}
+            %wide{k} = zext i32 %at{k} to i64
+            %where{k} = getelementptr <4 x i32>, ptr %nodes, i64 %wide{k}
+            %node{k} = load <4 x i32>, ptr %where{k}, align 4
+        """)
     rows = text.joined([f"node{k}" for k in range(LANES)], "i32", 4)
     for word in range(4):
         text.column(f"word{word}", rows, "i32", 4, word)
@@ -155,10 +185,13 @@ def _load_nodes(text: _Text) -> None:
 def _load_view(text: _Text) -> None:
     """%view0 .. %view8 of the only view: views (9, n), read in place."""
     for c in range(VIEW):
-        text(f"%skip{c} = mul i64 %stride, {c}")
-        text(f"%spot{c} = add i64 %skip{c}, %first")
-        text(f"%from{c} = getelementptr float, ptr %views, i64 %spot{c}")
-        text(f"%view{c} = load {_FLOATS}, ptr %from{c}, align 4")
+        text(f"""
+            %skip{c} = mul i64 %stride, {c}
+            %spot{c} = add i64 %skip{c}, %first
+            %from{c} = getelementptr float, ptr %views, i64 %spot{c}
+            %view{c} = load {_FLOATS}, ptr %from{c}, align 4
+        """)
+    text(_MIDDLE)
 
 
 def _load_views(text: _Text) -> None:
@@ -166,28 +199,25 @@ def _load_views(text: _Text) -> None:
     text(f"%channel.view = select {_BITS} %is_scalar, {_INTS} zeroinitializer, {_INTS} %channel")
     before = "undef"
     for k in range(LANES):
-        text(f"%ch{k} = extractelement {_INTS} %channel.view, i32 {k}")
-        text(f"%chw{k} = zext i32 %ch{k} to i64")
-        text(f"%chs{k} = mul i64 %chw{k}, {VIEW}")
-        text(f"%lane{k} = add i64 %first, {k}")
-        text(f"%own{k} = mul i64 %lane{k}, %stride")
-        text(f"%begin{k} = add i64 %own{k}, %chs{k}")
-        text(f"%from{k} = getelementptr float, ptr %views, i64 %begin{k}")
-        text(f"%eight{k} = load <8 x float>, ptr %from{k}, align 4")
-        text(f"%ninth{k} = getelementptr float, ptr %from{k}, i64 8")
-        text(f"%high{k} = load float, ptr %ninth{k}, align 4")
-        text(f"%highs{k} = insertelement {_FLOATS} {before}, float %high{k}, i32 {k}")
+        text(f"""
+            %ch{k} = extractelement {_INTS} %channel.view, i32 {k}
+            %chw{k} = zext i32 %ch{k} to i64
+            %chs{k} = mul i64 %chw{k}, {VIEW}
+            %lane{k} = add i64 %first, {k}
+            %own{k} = mul i64 %lane{k}, %stride
+            %begin{k} = add i64 %own{k}, %chs{k}
+            %from{k} = getelementptr float, ptr %views, i64 %begin{k}
+            %eight{k} = load <8 x float>, ptr %from{k}, align 4
+            %ninth{k} = getelementptr float, ptr %from{k}, i64 8
+            %high{k} = load float, ptr %ninth{k}, align 4
+            %highs{k} = insertelement {_FLOATS} {before}, float %high{k}, i32 {k}
+        """)
         before = f"%highs{k}"
     rows = text.joined([f"eight{k}" for k in range(LANES)], "float", 8)
     for c in range(8):
         text.column(f"view{c}", rows, "float", 8, c)
     text(f"%view8 = fadd {_FLOATS} {before}, {_same('float', '-0.0')}")
-
-
-def _middle(text: _Text) -> None:
-    """%middle_u and %middle_v: the joint's crop pixel plus one half, for rounding."""
-    for c, axis in ((0, "u"), (1, "v")):
-        text(f"%middle_{axis} = fadd {_FLOATS} %view{c}, {_same('float', '0.5')}")
+    text(_MIDDLE)
 
 
 def llvm_text(name: str, multi_view: bool) -> str:
@@ -211,71 +241,51 @@ def llvm_text(name: str, multi_view: bool) -> str:
         ("own", "scalar_base", _INTS),
         ("inv", "inverse", _FLOATS),
     ):
-        text(f"%{vector}.p = getelementptr i32, ptr %{pointer}, i64 %first")
-        text(f"%{vector} = load {type_}, ptr %{vector}.p, align 4")
+        text(f"""
+            %{vector}.p = getelementptr i32, ptr %{pointer}, i64 %first
+            %{vector} = load {type_}, ptr %{vector}.p, align 4
+        """)
     if not multi_view:
         _load_view(text)
-        _middle(text)
     text("br label %loop")
     text.lines.append("loop:")
     text(f"%at = phi {_INTS} [%start, %entry], [%next, %loop]")
     _load_nodes(text)
-    text(f"%kind = and {_INTS} %word3, {_same('i32', 3)}")
-    text(f"%channel = ashr {_INTS} %word3, {_same('i32', 2)}")
-    text(f"%is_one = icmp eq {_INTS} %kind, {_same('i32', ONE_PROBE)}")
-    text(f"%is_scalar = icmp eq {_INTS} %kind, {_same('i32', SCALAR)}")
+    text(f"""
+        %kind = and {_INTS} %word3, {_same("i32", 3)}
+        %channel = ashr {_INTS} %word3, {_same("i32", 2)}
+        %is_one = icmp eq {_INTS} %kind, {_same("i32", ONE_PROBE)}
+        %is_scalar = icmp eq {_INTS} %kind, {_same("i32", SCALAR)}
+    """)
     if multi_view:
         _load_views(text)
-        _middle(text)
-    for offset, word, byte in (
-        ("u0", 0, 0),
-        ("u1", 0, 1),
-        ("u2", 0, 2),
-        ("v0", 0, 3),
-        ("v1", 1, 0),
-        ("v2", 1, 1),
-    ):
-        text.signed_byte(offset, f"word{word}", byte)
+    for k, offset in enumerate(("u0", "u1", "u2", "v0", "v1", "v2")):
+        text.signed_byte(offset, f"word{k // 4}", k % 4)
     text.pixel_of("under_u", ["u0", "u1", "u2"])
     text.pixel_of("under_v", ["v0", "v1", "v2"])
-    text(f"%scalar = add {_INTS} %own, %channel")
-    text(f"%place = select {_BITS} %is_scalar, {_INTS} %scalar, {_INTS} %under_u")
+    text(f"""
+        %scalar = add {_INTS} %own, %channel
+        %place = select {_BITS} %is_scalar, {_INTS} %scalar, {_INTS} %under_u
+    """)
     text.read("a", "place")
     text.read("b", "under_v")
-    text(f"%height = fmul {_FLOATS} %a, %inv")
-    text(f"%other = fmul {_FLOATS} %b, %inv")
-    text(f"%less = select {_BITS} %is_one, {_FLOATS} %view8, {_FLOATS} %other")
-    text(f"%difference = fsub {_FLOATS} %height, %less")
-    text(f"%value = select {_BITS} %is_scalar, {_FLOATS} %a, {_FLOATS} %difference")
-    text(f"%level = ashr {_INTS} %word1, {_same('i32', 16)}")
-    text(f"%threshold = sitofp {_INTS} %level to {_FLOATS}")
-    text(f"%right = fcmp oge {_FLOATS} %value, %threshold")
-    text(f"%step = zext {_BITS} %right to {_INTS}")
-    text(f"%child = add {_INTS} %word2, %step")
-    text(f"%inner = icmp sge {_INTS} %word2, zeroinitializer")
-    text(f"%next = select {_BITS} %inner, {_INTS} %child, {_INTS} %at")
-    text(f"%more = call i1 @llvm.vector.reduce.or.v{LANES}i1({_BITS} %inner)")
-    text("br i1 %more, label %loop, label %done")
-    text.lines.append("done:")
-    text(f"%leaves = xor {_INTS} %word2, {_same('i32', -1)}")
-    text("%out = getelementptr i32, ptr %leaf, i64 %first")
-    text(f"store {_INTS} %leaves, ptr %out, align 4")
-    text("ret void")
-    pointers = ", ".join(
-        f"ptr noalias %{name}" for name in ("pixels", "base", "scalar_base", "inverse", "views")
-    )
-    return "\n".join(
-        [
-            f"declare {_INTS} @llvm.smin.v{LANES}i32({_INTS}, {_INTS})",
-            f"declare {_INTS} @llvm.smax.v{LANES}i32({_INTS}, {_INTS})",
-            f"declare i1 @llvm.vector.reduce.or.v{LANES}i1({_BITS})",
-            f"define weak_odr void @{name}(ptr noalias %nodes, i32 %root, {pointers}, i64 "
-            "%stride, i32 %side, ptr noalias %leaf, i64 %first) noinline {",
-            "entry:",
-            *text.lines,
-            "}",
-        ]
-    )
+    text(f"""
+        %height = fmul {_FLOATS} %a, %inv
+        %other = fmul {_FLOATS} %b, %inv
+        %less = select {_BITS} %is_one, {_FLOATS} %view8, {_FLOATS} %other
+        %difference = fsub {_FLOATS} %height, %less
+        %value = select {_BITS} %is_scalar, {_FLOATS} %a, {_FLOATS} %difference
+        %level = ashr {_INTS} %word1, {_same("i32", 16)}
+        %threshold = sitofp {_INTS} %level to {_FLOATS}
+        %right = fcmp oge {_FLOATS} %value, %threshold
+        %step = zext {_BITS} %right to {_INTS}
+        %child = add {_INTS} %word2, %step
+        %inner = icmp sge {_INTS} %word2, zeroinitializer
+        %next = select {_BITS} %inner, {_INTS} %child, {_INTS} %at
+        %more = call i1 {_ANY}({_BITS} %inner)
+        br i1 %more, label %loop, label %done
+    """)
+    return _FUNCTION.format(name=name, body="\n".join(text.lines))
 
 
 def _emit(name: str, multi_view: bool) -> Any:

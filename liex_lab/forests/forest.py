@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, VIEW, descend
 from liex_lab.runtime.kernels import kernel
-from liex_lab.runtime.shapes import check_index, check_shapes
+from liex_lab.runtime.shapes import Rows, check_index, check_shapes
 from liex_lab.runtime.threads import in_parallel
 
 Array = NDArray[np.float64]
@@ -66,40 +66,22 @@ class Forest:
         return Forest(self.nodes, self.roots, leaves)
 
     @staticmethod
-    def pack(trees: list[tuple[NDArray[np.int32], NDArray[np.float32]]]) -> Forest:
-        """Pack trees into one forest.
-
-        Args:
-            trees: (nodes, leaves) of each tree, with its root at node 0 and its own leaf numbers.
-
-        Returns:
-            The forest; child pointers and leaf numbers are shifted to its arrays.
-        """
-        return Forest.join(
-            [Forest(nodes, np.zeros(1, np.int32), leaves) for nodes, leaves in trees]
-        )
-
-    @staticmethod
     def join(forests: list[Forest]) -> Forest:
         """Join forests, with equally many values per leaf, into one of all their trees; its
         prediction is the mean over all the trees.
         """
+        first_node = np.cumsum([0, *(len(forest.nodes) for forest in forests)])
+        first_leaf = np.cumsum([0, *(len(forest.leaves) for forest in forests)])
         nodes = []
-        roots = []
-        leaves = []
-        n_nodes = n_leaves = 0
-        for forest in forests:
-            shifted = forest.nodes.copy()
-            inner = shifted[:, 2] >= 0
-            shifted[inner, 2] += n_nodes
-            shifted[~inner, 2] -= n_leaves
-            nodes.append(shifted)
-            leaves.append(forest.leaves)
-            roots.append(forest.roots + n_nodes)
-            n_nodes += len(forest.nodes)
-            n_leaves += len(forest.leaves)
+        for k, forest in enumerate(forests):
+            nodes.append(forest.nodes.copy())
+            inner = forest.nodes[:, 2] >= 0
+            nodes[-1][:, 2] += np.where(inner, first_node[k], -first_leaf[k]).astype(np.int32)
+        roots = [forest.roots + first for forest, first in zip(forests, first_node, strict=False)]
         return Forest(
-            np.concatenate(nodes), np.concatenate(roots).astype(np.int32), np.concatenate(leaves)
+            np.concatenate(nodes),
+            np.concatenate(roots).astype(np.int32),
+            np.concatenate([forest.leaves for forest in forests]),
         )
 
 
@@ -193,7 +175,7 @@ def check_samples(forest: Forest, samples: Samples) -> None:
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(Rows):
     """Input of a forest in training or prediction: n samples on a set of height maps.
 
     Attributes:
@@ -204,6 +186,7 @@ class Samples:
         scalars: (n, n_scalars) float32 numbers that describe the whole animal.
     """
 
+    SHARED = ("heights",)
     heights: NDArray[np.int16]
     image: NDArray[np.int32]
     inverse_size: NDArray[np.float32]
@@ -225,25 +208,6 @@ class Samples:
     def __len__(self) -> int:
         """Number of samples."""
         return len(self.image)
-
-    def __getitem__(self, index: NDArray[np.int64]) -> Samples:
-        """Select rows (m,); the height maps stay the same."""
-        return Samples(
-            self.heights,
-            self.image[index],
-            self.inverse_size[index],
-            self.views[index],
-            self.scalars[index],
-        )
-
-    @staticmethod
-    def join(parts: list[Samples]) -> Samples:
-        """Concatenate sets of samples on the same height maps, those of the first."""
-        fields = ("image", "inverse_size", "views", "scalars")
-        return Samples(
-            parts[0].heights,
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in fields),
-        )
 
 
 def predict(

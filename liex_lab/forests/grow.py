@@ -139,13 +139,10 @@ def grow_forest(
     n = len(samples)
     check_shapes("a forest's growth", ("labels", labels, (n, "D")), ("keep", keep, (n,)))
     in_bag = np.zeros((plan.n_trees, n_images), np.bool_)
-    for t in range(plan.n_trees):
-        in_bag[t, rng.permutation(n_images)[: max(1, round(plan.bag_share * n_images))]] = True
-    members = [
-        np.flatnonzero(keep & in_bag[t][samples.image]).astype(np.int32)
-        for t in range(plan.n_trees)
-    ]
-    starts = np.concatenate([[0], np.cumsum([len(m) for m in members])]).astype(np.int64)
+    for bag in in_bag:
+        bag[rng.permutation(n_images)[: max(1, round(plan.bag_share * n_images))]] = True
+    members = [np.flatnonzero(keep & bag[samples.image]).astype(np.int32) for bag in in_bag]
+    starts = np.cumsum([0, *(len(m) for m in members)], dtype=np.int64)
     order = np.concatenate(members)
     capacity = max(1, max(len(m) for m in members) // max(1, plan.min_leaf)) + 1
     nodes = np.zeros((plan.n_trees, 2 * capacity + 1, 4), np.int32)
@@ -169,8 +166,12 @@ def grow_forest(
         leaves,
         counts,
     )
-    trees = [(nodes[t, : counts[t, 0]], leaves[t, : counts[t, 1]]) for t in range(plan.n_trees)]
-    return Forest.pack(trees), in_bag
+    root = np.zeros(1, np.int32)
+    trees = [
+        Forest(nodes[t, :n_nodes], root, leaves[t, :n_leaves])
+        for t, (n_nodes, n_leaves) in enumerate(counts)
+    ]
+    return Forest.join(trees), in_bag
 
 
 def boost_forest(
@@ -448,13 +449,9 @@ def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
         np.empty((_N_THRESHOLDS + 1, n_labels + 1)),
     )
     best = np.empty(4, np.int32)
-    stack = np.empty(
-        (4 * growth.max_depth + 8, 4), np.int64
-    )  # node, first member, past the last, depth
-    stack[0, 0] = 0
-    stack[0, 1] = 0
+    # node, first member, past the last, depth
+    stack = np.zeros((4 * growth.max_depth + 8, 4), np.int64)
     stack[0, 2] = members.size
-    stack[0, 3] = 0
     top = 1
     n_nodes = 1
     n_leaves = 0
@@ -487,17 +484,12 @@ def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
         nodes[node, 1] = (best[1] & 0xFFFF) | (best[3] << 16)
         nodes[node, 2] = n_nodes
         nodes[node, 3] = best[2]
-        right = stack[top]
-        left = stack[top + 1]
-        right[0] = n_nodes + 1
-        right[1] = first + middle
-        right[2] = stop
-        right[3] = depth + 1
-        left[0] = n_nodes
-        left[1] = first
-        left[2] = first + middle
-        left[3] = depth + 1
-        top += 2
+        for side in (1, 0):  # the left child is grown first
+            stack[top, 0] = n_nodes + side
+            stack[top, 1] = first + middle * side
+            stack[top, 2] = stop if side else first + middle
+            stack[top, 3] = depth + 1
+            top += 1
         n_nodes += 2
     counts[0] = n_nodes
     counts[1] = n_leaves

@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.geometry import so3
+from liex_lab.runtime.shapes import Rows
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class SE3:
+class SE3(Rows):
     """Rigid transforms, one or a batch: `T_a_b` transforms points of frame b to frame a.
 
     A tangent vector is (wx, wy, wz, vx, vy, vz), as in the paper: radians, then millimetres.
@@ -118,10 +119,8 @@ class SE3:
         """
         if isinstance(other, SE3):
             return SE3(self.rotation @ other.rotation, self @ other.translation)
-        return (
-            np.einsum("...ij,...j->...i", self.rotation, np.asarray(other, float))
-            + self.translation
-        )
+        turned = np.einsum("...ij,...j->...i", self.rotation, np.asarray(other, float))
+        return turned + self.translation
 
     def geodesic(self, other: SE3, s: ArrayLike) -> SE3:
         """The curve from self (s = 0) to other (s = 1); rotation and translation follow their own
@@ -150,14 +149,15 @@ def product_of_exponentials(twists: ArrayLike) -> SE3:
         A batch (..., J).
     """
     links = SE3.exp(twists)
-    rotations = []
-    translations = []
-    so_far = SE3.identity(*links.translation.shape[:-2])
+    products = [SE3.identity(*links.translation.shape[:-2])]
     for j in range(links.translation.shape[-2]):
-        so_far = so_far @ SE3(links.rotation[..., j, :, :], links.translation[..., j, :])
-        rotations.append(so_far.rotation)
-        translations.append(so_far.translation)
-    return SE3(np.stack(rotations, axis=-3), np.stack(translations, axis=-2))
+        products.append(
+            products[-1] @ SE3(links.rotation[..., j, :, :], links.translation[..., j, :])
+        )
+    return SE3(
+        np.stack([product.rotation for product in products[1:]], axis=-3),
+        np.stack([product.translation for product in products[1:]], axis=-2),
+    )
 
 
 # Left-invariant Brownian motion on SE(3) (Lie-X Eq. 6 and 7).
@@ -203,15 +203,13 @@ def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) 
         raise ValueError(
             f"times must lie within the path, 0 to {len(z) * delta} s, got {t.min()} to {t.max()} s"
         )
-    nodes = [start]
-    for step in z:
-        nodes.append(nodes[-1] @ SE3.exp(np.sqrt(delta) * step))
+    nodes = product_of_exponentials(np.sqrt(delta) * np.concatenate([np.zeros((1, 6)), z]))
     before = np.minimum((t / delta).astype(int), len(z) - 1)
-    at_node = SE3(
-        np.stack([nodes[k].rotation for k in before]),
-        np.stack([nodes[k].translation for k in before]),
+    return (
+        start
+        @ nodes[before]
+        @ SE3.exp(((t - before * delta) / np.sqrt(delta))[:, None] * z[before])
     )
-    return at_node @ SE3.exp(((t - before * delta) / np.sqrt(delta))[:, None] * z[before])
 
 
 def brownian_ends(start: SE3, steps: ArrayLike, delta: float, time: float) -> SE3:

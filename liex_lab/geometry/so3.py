@@ -52,17 +52,12 @@ def cross(a: Array, b: Array) -> Array:
     return out
 
 
-def vee(matrix: ArrayLike) -> Array:
-    """Vectors of skew matrices: the inverse of `hat`.
-
-    Args:
-        matrix: (..., 3, 3).
-
-    Returns:
-        (..., 3).
-    """
-    m = np.asarray(matrix, float)
-    return np.stack([m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]], axis=-1)
+def _angles(omega: ArrayLike, least: float) -> tuple[Array, Array, NDArray[np.bool_], Array]:
+    """Skew matrices, th^2, whether th^2 is below `least`, and th (1 where it is)."""
+    w = np.asarray(omega, float)
+    th2 = np.sum(w * w, axis=-1)[..., None, None]
+    small = th2 < least
+    return hat(w), th2, small, np.sqrt(np.where(small, 1.0, th2))
 
 
 def exp(omega: ArrayLike) -> Array:
@@ -74,14 +69,10 @@ def exp(omega: ArrayLike) -> Array:
     Returns:
         (..., 3, 3).
     """
-    w = np.asarray(omega, float)
-    th2 = np.sum(w * w, axis=-1)[..., None, None]
-    small = th2 < _SMALL_EXP
-    th = np.sqrt(np.where(small, 1.0, th2))
+    w_hat, th2, small, th = _angles(omega, _SMALL_EXP)
     a = np.where(small, 1.0 - th2 / 6.0, np.sin(th) / th)
     # 2 sin^2(th/2) / th^2 keeps all digits where 1 - cos(th) would cancel
     b = np.where(small, 0.5 - th2 / 24.0, 2.0 * np.sin(th / 2.0) ** 2 / (th * th))
-    w_hat = hat(w)
     return np.eye(3) + a * w_hat + b * (w_hat @ w_hat)
 
 
@@ -155,13 +146,9 @@ def left_jacobian(omega: ArrayLike) -> Array:
     Returns:
         (..., 3, 3).
     """
-    w = np.asarray(omega, float)
-    th2 = np.sum(w * w, axis=-1)[..., None, None]
-    small = th2 < _SMALL_A
-    th = np.sqrt(np.where(small, 1.0, th2))
+    w_hat, th2, small, th = _angles(omega, _SMALL_A)
     b = np.where(small, 0.5 - th2 / 24.0, 2.0 * np.sin(th / 2.0) ** 2 / (th * th))
     c = np.where(small, 1.0 / 6.0 - th2 / 120.0, (th - np.sin(th)) / th**3)
-    w_hat = hat(w)
     return np.eye(3) + b * w_hat + c * (w_hat @ w_hat)
 
 
@@ -176,16 +163,13 @@ def left_jacobian_inverse(omega: ArrayLike) -> Array:
     Returns:
         (..., 3, 3).
     """
-    w = np.asarray(omega, float)
-    th2 = np.sum(w * w, axis=-1)[..., None, None]
-    small = th2 < _SMALL_A
-    half = 0.5 * np.sqrt(np.where(small, 1.0, th2))
+    w_hat, th2, small, th = _angles(omega, _SMALL_A)
+    half = 0.5 * th
     c = np.where(
         small,
         1.0 / 12.0 + th2 / 720.0,
         (1.0 - half * np.cos(half) / np.sin(half)) / np.where(small, 1, th2),
     )
-    w_hat = hat(w)
     return np.eye(3) - 0.5 * w_hat + c * (w_hat @ w_hat)
 
 

@@ -301,6 +301,11 @@ class Camera(Lens):
         return Camera(fx, fy, cx, cy, width, height, self.source, distortion=self.distortion)
 
     @property
+    def intrinsics(self) -> Array:
+        """Focal lengths and principal point (4,): fx, fy, cx, cy, px."""
+        return np.array([self.fx, self.fy, self.cx, self.cy])
+
+    @property
     def matrix(self) -> Array:
         """The intrinsic matrix K (3, 3), px."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])

@@ -186,7 +186,7 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
 def _open(path: Path, how: _How) -> Recording:
     # address of a virtual recording; rendering is a higher layer than reading, so only named here
     if str(path).startswith("synthetic:"):
-        rendered: Recording = import_module("liex_lab.simulation.address").open_synthetic(
+        rendered: Recording = import_module("liex_lab.simulation.simulator").open_synthetic(
             str(path), how.camera
         )
         return rendered

@@ -1,4 +1,4 @@
-"""Shape checks of arrays, done once before compiled code reads them.
+"""Records of arrays with rows, and shape checks done once before compiled code reads them.
 
 Kernels do not check indices: a row that is too narrow yields the numbers that follow it, and no
 error. Callers that pass arrays to a kernel check them here, or pass a record that was checked when
@@ -7,7 +7,44 @@ it was created.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, ClassVar, Self
+
+import numpy as np
 from numpy.typing import NDArray
+
+
+class Rows:
+    """Base of dataclasses whose arrays all have one row per item (a frame, an animal, a sample).
+
+    Fields that are neither arrays nor such records belong to all rows, as do those in `SHARED`.
+    """
+
+    SHARED: ClassVar[tuple[str, ...]] = ()
+
+    def __getitem__(self, index: Any) -> Self:
+        """Some rows, by mask, row numbers, slice or number; a tuple for multiple batch axes."""
+        columns = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        rows = {name: value[index] for name, value in columns.items() if self._has_rows(name)}
+        return type(self)(**columns | rows)
+
+    @classmethod
+    def join(cls, parts: Sequence[Self]) -> Self:
+        """Concatenate the rows of at least one part; all else is that of the first."""
+        columns: dict[str, Any] = {}
+        for field in fields(cls):  # type: ignore[arg-type]
+            values = [getattr(part, field.name) for part in parts]
+            if not parts[0]._has_rows(field.name):
+                columns[field.name] = values[0]
+            elif isinstance(values[0], Rows):
+                columns[field.name] = type(values[0]).join(values)
+            else:
+                columns[field.name] = np.concatenate(values)
+        return cls(**columns)
+
+    def _has_rows(self, name: str) -> bool:
+        return name not in self.SHARED and isinstance(getattr(self, name), np.ndarray | Rows)
 
 
 def check_shapes(whose: str, *wanted: tuple[str, NDArray, tuple[int | str, ...]]) -> None:

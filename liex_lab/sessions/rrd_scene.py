@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions import vocabulary
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.estimation.session_shape import built
@@ -435,7 +436,7 @@ def body_of(skeleton: Skeleton, animal: Mapping[str, Any]) -> tuple[Surface, flo
     shape = animal.get("shape") or {}
     average = Surface.of(skeleton)
     girth = float(animal.get("girth", 1.0))
-    if not shape.get("kept") or average.shape is None:
+    if not shape.get("kept") or not isinstance(average.body, BodyShape):
         return average, girth
     return built(skeleton, shape["width"], shape["height"], shape["places"]), girth
 

@@ -2,8 +2,8 @@
 
 The ray (x, y, 1) of a pixel, rotated into the arena frame, meets the floor at depth height / -d_z
 and a vertical wall at distance / (outward . d_xy); meshes keep the largest 1 / z at each pixel's
-centre. `draw_windows` makes training patches with their learned background, `frames_parallel` whole
-depth images.
+centre. `draw_windows` makes training patches with their learned background, `draw_frames` whole
+depth images, `draw_hands` images and patches of hands.
 """
 
 from __future__ import annotations
@@ -13,13 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from liex_lab.body._rasterizer_kernels import draw
-from liex_lab.runtime.kernels import inner_kernel, kernel
+from liex_lab.body._rasterizer_kernels import draw_projected, project
+from liex_lab.runtime.kernels import kernel
 from liex_lab.simulation._sensor_kernels import (
-    ANIMAL,
     BACKGROUND,
     NOTHING,
-    OBJECT,
     STILL,
     UNIT,
     normal,
@@ -27,36 +25,28 @@ from liex_lab.simulation._sensor_kernels import (
     smooth_field,
 )
 
-
-class Wall(NamedTuple):
-    """A straight wall; the fields are in the order of the packed array.
-
-    Attributes:
-        normal_x: x of its outward normal in the floor.
-        normal_y: y of its outward normal in the floor.
-        distance: from the arena's origin, mm; 0 is no wall.
-        height: mm.
-        rounding: depth of the rounding that multiple reflections leave at its foot, mm.
-        rounding_reach: its extent, mm.
-    """
-
-    normal_x: Any
-    normal_y: Any
-    distance: Any
-    height: Any
-    rounding: Any
-    rounding_reach: Any
+# columns of a straight wall: its outward normal in the floor; its distance from the arena's origin,
+# mm, 0 for no wall; height, mm; depth and extent of the rounding that multiple reflections leave at
+# its foot, mm
+(
+    WALL_X,
+    WALL_Y,
+    WALL_DISTANCE,
+    WALL_HEIGHT,
+    WALL_ROUNDING,
+    WALL_REACH,
+) = range(6)
 
 
-WALL_COLUMNS = len(Wall._fields)
+WALL_COLUMNS = 6
 
 
 class SensorNoise(NamedTuple):
-    """A sensor and its noise; for many images, parameters and seed have a leading axis (n,).
+    """A sensor and its noise in n images.
 
     Attributes:
-        parameters: (N_PARAMETERS,) of the sensor.
-        seed: uint64 of the noise, not 0.
+        parameters: (n, N_PARAMETERS) of the sensor.
+        seed: (n,) uint64 of the noise, not 0.
         table: (2^13,) float32 normal quantiles.
     """
 
@@ -66,45 +56,54 @@ class SensorNoise(NamedTuple):
 
 
 class PatchCamera(NamedTuple):
-    """The camera of an image or of a patch of it; for many, all with a leading axis (n,).
+    """The cameras of n images or patches of images.
 
     Attributes:
-        intrinsics: (4,) fx, fy, cx, cy, px.
-        picture: (2,) int64 width and height of the whole image, px; pixels outside are unread.
-        origin: (2,) int64 pixel (u, v) of the whole image at (0, 0) of the patch.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        size: (n, 2) int64 width and height of the whole image, px; pixels outside are unread.
+        origin: (n, 2) int64 pixel (u, v) of the whole image at (0, 0) of the patch.
     """
 
     intrinsics: Any
-    picture: Any
+    size: Any
     origin: Any
 
 
-class Meshes(NamedTuple):
-    """An animal and an optional object; for many images, all but faces with a leading axis (n,).
+class Part(NamedTuple):
+    """One object in n images.
 
     Attributes:
-        animal: (V, 3) mesh of the animal, mm, arena frame.
+        vertices: (n, V, 3) mesh, mm.
         faces: (F, 3) int32 its triangles.
-        thing: (W, 3) mesh of the object next to it, mm, arena frame.
-        thing_faces: (G, 3) int32 its triangles.
-        has_thing: whether the object exists.
+        shown: (n,) bool, whether it exists.
+        label: kind of its pixels, ANIMAL or OBJECT.
     """
 
-    animal: Any
+    vertices: Any
     faces: Any
-    thing: Any
-    thing_faces: Any
-    has_thing: Any
+    shown: Any
+    label: Any
+
+
+def part_of(vertices: Any, faces: Any, label: int, shown: Any = None) -> Part:
+    """A `Part` with arrays as the kernels need them; None shows it in all images."""
+    n = len(vertices)
+    return Part(
+        np.ascontiguousarray(vertices, float),
+        np.ascontiguousarray(faces, np.int32),
+        np.ones(n, np.bool_) if shown is None else np.ascontiguousarray(shown, np.bool_),
+        label,
+    )
 
 
 class ArenaView(NamedTuple):
-    """A camera above a floor with at most one wall; for many patches, all with a leading axis (n,).
+    """Cameras above a floor with at most one wall, of n patches.
 
     Attributes:
-        R_arena_camera: (3, 3) rotation of the camera.
-        height: of the camera above the floor, mm.
-        wall: (WALL_COLUMNS,) the wall.
-        rough: unevenness of the floor, mm.
+        R_arena_camera: (n, 3, 3) rotation of the camera.
+        height: (n,) of the camera above the floor, mm.
+        wall: (n, WALL_COLUMNS) the wall.
+        rough: (n,) unevenness of the floor, mm.
     """
 
     R_arena_camera: Any
@@ -113,48 +112,18 @@ class ArenaView(NamedTuple):
     rough: Any
 
 
-@inner_kernel()
-def noise_of(noises, i):
-    """The `SensorNoise` of image i."""
-    return SensorNoise(noises.parameters[i], noises.seed[i], noises.table)
-
-
-@inner_kernel()
-def camera_of(cameras, i):
-    """The `PatchCamera` of image i."""
-    return PatchCamera(cameras.intrinsics[i], cameras.picture[i], cameras.origin[i])
-
-
-@inner_kernel()
-def _meshes_of(meshes, i):
-    """The `Meshes` of image i."""
-    return Meshes(
-        meshes.animal[i],
-        meshes.faces,
-        meshes.thing[i],
-        meshes.thing_faces,
-        meshes.has_thing[i],
-    )
-
-
-@inner_kernel()
-def _unpack_wall(packed):
-    """The record of one packed wall (WALL_COLUMNS,)."""
-    return Wall(packed[0], packed[1], packed[2], packed[3], packed[4], packed[5])
-
-
-@inner_kernel()
-def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, rough, depth, what):
+@kernel()
+def floor_and_wall(u0, v0, size, intrinsics, rotation, height, wall, uneven, rough, depth, what):
     """Ideal depth and kind of a patch (H, W) on a floor with at most one straight wall.
 
     Args:
         u0: column of the patch's first pixel in the whole image.
         v0: its row.
-        picture: (2,) width and height of the whole image, px; pixels outside are unread.
+        size: (2,) width and height of the whole image, px; pixels outside are unread.
         intrinsics: (4,) fx, fy, cx, cy, px.
         rotation: (3, 3) of T_arena_camera.
         height: of the camera above the floor, mm.
-        wall: the wall.
+        wall: (WALL_COLUMNS,).
         uneven: (H, W) heights of the floor, over `rough`.
         rough: height of the floor per unit of `uneven`, mm.
         depth: (H, W) float32 mm, output, 0 = nothing.
@@ -167,7 +136,7 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
             u = u0 + c
             depth[r, c] = 0.0
             what[r, c] = NOTHING
-            if u < 0 or v < 0 or u >= picture[0] or v >= picture[1]:
+            if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
                 continue
             x = (u - intrinsics[2]) / intrinsics[0]
             y = (v - intrinsics[3]) / intrinsics[1]
@@ -178,36 +147,21 @@ def floor_and_wall(u0, v0, picture, intrinsics, rotation, height, wall, uneven, 
                 continue
             t = -height / dz
             raised = rough * uneven[r, c]
-            if wall.distance > 0.0:
-                across = wall.normal_x * dx + wall.normal_y * dy
-                beyond = across * t - wall.distance
+            if wall[WALL_DISTANCE] > 0.0:
+                across = wall[WALL_X] * dx + wall[WALL_Y] * dy
+                beyond = across * t - wall[WALL_DISTANCE]
                 if beyond > 0.0:
-                    t = wall.distance / across
-                    if height + t * dz < wall.height:
+                    t = wall[WALL_DISTANCE] / across
+                    if height + t * dz < wall[WALL_HEIGHT]:
                         depth[r, c] = t
                         what[r, c] = STILL
                     continue
-                raised += wall.rounding * np.exp(beyond / wall.rounding_reach)
+                raised += wall[WALL_ROUNDING] * np.exp(beyond / wall[WALL_REACH])
             depth[r, c] = t + raised / dz
             what[r, c] = STILL
 
 
 @kernel()
-def merge(inverse, label, top, left, depth, what):
-    """Merge a rendered mesh (inverse depth, h, w) at row `top`, column `left`, by z-buffer.
-
-    The pixels that it covers get the kind `label` in `what`.
-    """
-    for r in range(inverse.shape[0]):
-        for c in range(inverse.shape[1]):
-            if inverse[r, c] > 0.0:
-                z = 1.0 / inverse[r, c]
-                if depth[top + r, left + c] == 0.0 or z < depth[top + r, left + c]:
-                    depth[top + r, left + c] = z
-                    what[top + r, left + c] = label
-
-
-@inner_kernel()
 def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label, depth, what):
     """Rasterise a mesh into an image or patch, within the mesh's bounding box only.
 
@@ -223,25 +177,18 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
         depth: (H, W) float32 mm, changed in place.
         what: (H, W) uint8 kinds, changed in place.
     """
+    projected = np.empty((len(vertices), 3))
+    project(vertices, rotation, translation, intrinsics, projected)
     low_u = 1e9
     low_v = 1e9
     high_u = -1e9
     high_v = -1e9
     for i in range(len(vertices)):
-        x = vertices[i, 0]
-        y = vertices[i, 1]
-        z = vertices[i, 2]
-        zc = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
-        if zc <= 1.0:
-            continue
-        xc = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
-        yc = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
-        u = intrinsics[0] * xc / zc + intrinsics[2]
-        v = intrinsics[1] * yc / zc + intrinsics[3]
-        low_u = min(low_u, u)
-        high_u = max(high_u, u)
-        low_v = min(low_v, v)
-        high_v = max(high_v, v)
+        if projected[i, 2] > 0.0:
+            low_u = min(low_u, projected[i, 0])
+            high_u = max(high_u, projected[i, 0])
+            low_v = min(low_v, projected[i, 1])
+            high_v = max(high_v, projected[i, 1])
     left = max(0, int(low_u) - int(u0) - 1)
     top = max(0, int(low_v) - int(v0) - 1)
     right = min(depth.shape[1], int(high_u) - int(u0) + 2)
@@ -249,61 +196,46 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
     if low_u > high_u or left >= right or top >= bottom:
         return
     inverse = np.zeros((bottom - top, right - left))
-    draw(
-        vertices,
-        faces,
-        rotation,
-        translation,
-        intrinsics[0],
-        intrinsics[1],
-        intrinsics[2],
-        intrinsics[3],
-        u0 + left,
-        v0 + top,
-        inverse,
-    )
-    merge(inverse, label, top, left, depth, what)
+    draw_projected(projected, faces, u0 + left, v0 + top, inverse)
+    for r in range(inverse.shape[0]):
+        for c in range(inverse.shape[1]):
+            if inverse[r, c] > 0.0:
+                z = 1.0 / inverse[r, c]
+                if depth[top + r, left + c] == 0.0 or z < depth[top + r, left + c]:
+                    depth[top + r, left + c] = z
+                    what[top + r, left + c] = label
 
 
-@inner_kernel()
-def _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what):
-    """Rasterise the animal and, if present, the object into an image or patch."""
-    draw_onto(
-        meshes.animal,
-        meshes.faces,
-        rotation,
-        translation,
-        intrinsics,
-        u0,
-        v0,
-        ANIMAL,
-        depth,
-        what,
-    )
-    if meshes.has_thing:
-        draw_onto(
-            meshes.thing,
-            meshes.thing_faces,
-            rotation,
-            translation,
-            intrinsics,
-            u0,
-            v0,
-            OBJECT,
-            depth,
-            what,
-        )
+@kernel()
+def draw_parts(parts, i, rotation, translation, intrinsics, u0, v0, depth, what):
+    """Rasterise the objects that exist in image i, see `draw_onto`."""
+    for part in parts:
+        if part.shown[i]:
+            draw_onto(
+                part.vertices[i],
+                part.faces,
+                rotation,
+                translation,
+                intrinsics,
+                u0,
+                v0,
+                part.label,
+                depth,
+                what,
+            )
 
 
-@inner_kernel()
-def _window(meshes, camera, view, noise, depth_out, background_out):
-    """One training patch: still scene, its learned background, animal, optional object, noise."""
+@kernel()
+def _draw_window(parts, i, cameras, views, noises, depth_out, background_out):
+    """One training patch: still scene, its learned background, objects, noise."""
     shape = depth_out.shape
-    intrinsics = camera.intrinsics
-    origin = camera.origin
-    sensor = noise.parameters
-    table = noise.table
-    state = np.array([noise.seed], np.uint64)
+    intrinsics = cameras.intrinsics[i]
+    size = cameras.size[i]
+    origin = cameras.origin[i]
+    height = views.height[i]
+    sensor = noises.parameters[i]
+    table = noises.table
+    state = np.array([noises.seed[i]], np.uint64)
     field = np.empty(shape, np.float32)
     depth = np.empty(shape, np.float32)
     what = np.empty(shape, np.uint8)
@@ -311,13 +243,13 @@ def _window(meshes, camera, view, noise, depth_out, background_out):
     floor_and_wall(
         origin[0],
         origin[1],
-        camera.picture,
+        size,
         intrinsics,
-        view.R_arena_camera,
-        view.height,
-        _unpack_wall(view.wall),
+        views.R_arena_camera[i],
+        height,
+        views.wall[i],
         field,
-        view.rough,
+        views.rough[i],
         depth,
         what,
     )
@@ -329,164 +261,89 @@ def _window(meshes, camera, view, noise, depth_out, background_out):
             background_out[r, c] = (
                 int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
             )
-    rotation = np.ascontiguousarray(view.R_arena_camera.T)
-    translation = -view.height * rotation[:, 2]
+    rotation = np.ascontiguousarray(views.R_arena_camera[i].T)
+    translation = -height * rotation[:, 2]
     u0 = float(origin[0])
     v0 = float(origin[1])
-    _draw_meshes(meshes, rotation, translation, intrinsics, u0, v0, depth, what)
+    draw_parts(parts, i, rotation, translation, intrinsics, u0, v0, depth, what)
     for r in range(shape[0]):
         for c in range(shape[1]):
             u = origin[0] + c
             v = origin[1] + r
-            if u < 0 or v < 0 or u >= camera.picture[0] or v >= camera.picture[1]:
+            if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
                 depth[r, c] = 0.0
-    sense(
-        depth,
-        what,
-        sensor,
-        intrinsics[0],
-        intrinsics[2] - u0,
-        intrinsics[3] - v0,
-        state,
-        table,
-        field,
-        depth_out,
-    )
+    centre_u = intrinsics[2] - u0
+    centre_v = intrinsics[3] - v0
+    sense(depth, what, sensor, intrinsics[0], centre_u, centre_v, state, table, field, depth_out)
 
 
 @kernel(parallel=True)
-def draw_windows(meshes, cameras, views, noises, depth_out, background_out):
+def draw_windows(animals, objects, cameras, views, noises, depth_out, background_out):
     """Render n training patches and their learned backgrounds, one thread per patch.
 
     Args:
-        meshes: `Meshes` of the patches.
-        cameras: `PatchCamera` of the patches.
-        views: `ArenaView` of the patches.
-        noises: `SensorNoise` of the patches.
+        animals: `Part` in the arena frame.
+        objects: `Part` likewise, objects next to them.
+        cameras: `PatchCamera`.
+        views: `ArenaView`.
+        noises: `SensorNoise`.
         depth_out: (n, S, S) uint16 in steps of the sensor's unit, output, 0 = unread.
         background_out: (n, S, S) uint16 likewise, the still scene as learned from many frames.
     """
     for i in prange(len(depth_out)):
-        view = ArenaView(views.R_arena_camera[i], views.height[i], views.wall[i], views.rough[i])
-        _window(
-            _meshes_of(meshes, i),
-            camera_of(cameras, i),
-            view,
-            noise_of(noises, i),
-            depth_out[i],
-            background_out[i],
-        )
+        parts = (animals, objects)  # a tuple of records cannot be passed to threads
+        _draw_window(parts, i, cameras, views, noises, depth_out[i], background_out[i])
 
 
 @kernel()
-def frame(still, meshes, rotation, translation, intrinsics, noise, out):
-    """Render one full frame: the still scene, the animal, an optional object, and the sensor.
-
-    Args:
-        still: (H, W) float32 mm, the ideal still scene, 0 = nothing.
-        meshes: `Meshes` of the frame.
-        rotation: (3, 3) of T_camera_arena.
-        translation: (3,) of T_camera_arena, mm.
-        intrinsics: (4,) fx, fy, cx, cy, px.
-        noise: `SensorNoise` of the frame.
-        out: (H, W) uint16 in steps of the sensor's unit, output, 0 = unread.
-    """
-    state = np.array([noise.seed], np.uint64)
+def _draw_frame(still, parts, i, rotation, translation, intrinsics, noises, out):
+    """One full frame: the still scene, the objects, and the sensor."""
+    state = np.array([noises.seed[i]], np.uint64)
     depth = still.copy()
     what = np.where(still > 0, np.uint8(STILL), np.uint8(NOTHING))
-    _draw_meshes(meshes, rotation, translation, intrinsics, 0.0, 0.0, depth, what)
-    field = np.empty(depth.shape, np.float32)
+    draw_parts(parts, i, rotation, translation, intrinsics, 0.0, 0.0, depth, what)
     sense(
         depth,
         what,
-        noise.parameters,
+        noises.parameters[i],
         intrinsics[0],
         intrinsics[2],
         intrinsics[3],
         state,
-        noise.table,
-        field,
+        noises.table,
+        np.empty(depth.shape, np.float32),
         out,
     )
 
 
 @kernel(parallel=True)
-def frames_parallel(still, meshes, rotation, translation, intrinsics, noises, out):
-    """Render n full frames of one scene, one thread per frame; see `frame`.
+def draw_frames(still, animals, objects, rotation, translation, intrinsics, noises, out):
+    """Render n full frames of one scene, one thread per frame.
 
     Args:
-        still: (H, W) float32 mm, shared.
-        meshes: `Meshes` of the frames.
-        rotation: (3, 3) of T_camera_arena, shared.
-        translation: (3,) of T_camera_arena, mm, shared.
-        intrinsics: (4,) fx, fy, cx, cy, px, shared.
-        noises: `SensorNoise` of the frames.
+        still: (H, W) float32 mm, the ideal still scene, 0 = nothing.
+        animals: `Part` in the arena frame.
+        objects: `Part` likewise, all other moving objects.
+        rotation: (3, 3) of T_camera_arena.
+        translation: (3,) of T_camera_arena, mm.
+        intrinsics: (4,) fx, fy, cx, cy, px.
+        noises: `SensorNoise`.
         out: (n, H, W) uint16 in steps of the sensor's unit, output, 0 = unread.
     """
     for i in prange(len(out)):
-        frame(
-            still,
-            _meshes_of(meshes, i),
-            rotation,
-            translation,
-            intrinsics,
-            noise_of(noises, i),
-            out[i],
-        )
-
-
-# Depth renderer of hands: wall plane, body, arm, hand and objects by z-buffer, then the sensor.
-
-
-class HandMeshes(NamedTuple):
-    """A hand and its surroundings; for many images, all but faces with a leading axis (n,).
-
-    Attributes:
-        hand: (V, 3) mesh, mm, camera frame.
-        hand_faces: (F, 3) int32 its triangles.
-        arm: (A, 3) mesh, mm, camera frame.
-        arm_faces: (G, 3) int32 its triangles.
-        body: (B, 3) mesh of the body behind it, mm, camera frame.
-        body_faces: (K, 3) int32 its triangles.
-        thing: (W, 3) mesh of the object, mm, camera frame.
-        thing_faces: (L, 3) int32 its triangles.
-        has_thing: whether the object exists.
-    """
-
-    hand: Any
-    hand_faces: Any
-    arm: Any
-    arm_faces: Any
-    body: Any
-    body_faces: Any
-    thing: Any
-    thing_faces: Any
-    has_thing: Any
+        parts = (animals, objects)
+        _draw_frame(still, parts, i, rotation, translation, intrinsics, noises, out[i])
 
 
 @kernel()
-def _put(vertices, faces, intrinsics, u0, v0, label, depth, what):
-    """Rasterise a mesh in the camera frame into an image or patch; see `draw_onto`."""
-    draw_onto(vertices, faces, np.eye(3), np.zeros(3), intrinsics, u0, v0, label, depth, what)
-
-
-@kernel()
-def picture(meshes, wall, camera, noise, out):
-    """Render one depth image or patch (H, W) of a hand.
-
-    Args:
-        meshes: `HandMeshes` of the image.
-        wall: (4,) a, b, c of 1 / z = a u + b v + c behind everything, and its unevenness, mm; c =
-            0: nothing in range.
-        camera: `PatchCamera` of the image.
-        noise: `SensorNoise` of the image.
-        out: (H, W) uint16 mm, output, 0 = unread.
-    """
+def _draw_hand(parts, i, wall, cameras, noises, out):
+    """One depth image or patch (H, W) of a hand in front of the plane `wall` (4,)."""
     shape = out.shape
-    intrinsics = camera.intrinsics
-    origin = camera.origin
-    table = noise.table
-    state = np.array([noise.seed], np.uint64)
+    intrinsics = cameras.intrinsics[i]
+    size = cameras.size[i]
+    origin = cameras.origin[i]
+    table = noises.table
+    state = np.array([noises.seed[i]], np.uint64)
     field = np.empty(shape, np.float32)
     depth = np.empty(shape, np.float32)
     what = np.empty(shape, np.uint8)
@@ -499,53 +356,35 @@ def picture(meshes, wall, camera, noise, out):
             what[r, c] = STILL if there else NOTHING
     u0 = float(origin[0])
     v0 = float(origin[1])
-    _put(meshes.body, meshes.body_faces, intrinsics, u0, v0, OBJECT, depth, what)
-    if meshes.has_thing:
-        _put(meshes.thing, meshes.thing_faces, intrinsics, u0, v0, OBJECT, depth, what)
-    _put(meshes.arm, meshes.arm_faces, intrinsics, u0, v0, ANIMAL, depth, what)
-    _put(meshes.hand, meshes.hand_faces, intrinsics, u0, v0, ANIMAL, depth, what)
+    draw_parts(parts, i, np.eye(3), np.zeros(3), intrinsics, u0, v0, depth, what)
     for r in range(shape[0]):
         for c in range(shape[1]):
             u = origin[0] + c
             v = origin[1] + r
-            if u < 0 or v < 0 or u >= camera.picture[0] or v >= camera.picture[1]:
+            if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
                 depth[r, c] = 0.0
                 what[r, c] = NOTHING
-    sense(
-        depth,
-        what,
-        noise.parameters,
-        intrinsics[0],
-        intrinsics[2] - u0,
-        intrinsics[3] - v0,
-        state,
-        table,
-        field,
-        out,
-    )
+    sensor = noises.parameters[i]
+    centre_u = intrinsics[2] - u0
+    centre_v = intrinsics[3] - v0
+    sense(depth, what, sensor, intrinsics[0], centre_u, centre_v, state, table, field, out)
 
 
 @kernel(parallel=True)
-def pictures(meshes, walls, cameras, noises, out):
-    """Render n depth images or patches of hands, one thread per image; see `picture`.
+def draw_hands(bodies, objects, arms, hands, walls, cameras, noises, out):
+    """Render n depth images or patches of hands, one thread per image.
 
     Args:
-        meshes: `HandMeshes` of the images.
-        walls: (n, 4) planes behind everything, as in `picture`.
-        cameras: `PatchCamera` of the images.
-        noises: `SensorNoise` of the images.
+        bodies: `Part` in the camera frame, behind the hands.
+        objects: `Part` likewise, objects next to them.
+        arms: `Part` likewise.
+        hands: `Part` likewise.
+        walls: (n, 4) a, b, c of 1 / z = a u + b v + c behind everything, and its unevenness, mm; c
+            = 0: nothing in range.
+        cameras: `PatchCamera`.
+        noises: `SensorNoise`.
         out: (n, H, W) uint16 mm, output, 0 = unread.
     """
     for i in prange(len(out)):
-        drawn = HandMeshes(
-            meshes.hand[i],
-            meshes.hand_faces,
-            meshes.arm[i],
-            meshes.arm_faces,
-            meshes.body[i],
-            meshes.body_faces,
-            meshes.thing[i],
-            meshes.thing_faces,
-            meshes.has_thing[i],
-        )
-        picture(drawn, walls[i], camera_of(cameras, i), noise_of(noises, i), out[i])
+        parts = (bodies, objects, arms, hands)
+        _draw_hand(parts, i, walls[i], cameras, noises, out[i])

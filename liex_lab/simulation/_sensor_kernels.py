@@ -15,6 +15,8 @@ indexed as below.
 
 from __future__ import annotations
 
+from statistics import NormalDist
+
 import numpy as np
 
 from liex_lab.runtime.kernels import inner_kernel, kernel
@@ -56,19 +58,21 @@ N_PARAMETERS = 18
 # distance from a light field's main lens to which its parameters refer; range noise grows with z^2
 TYPICAL_MM = 250.0
 
+
+_NEIGHBOURS = ((-1, 0), (1, 0), (0, -1), (0, 1))
+
+
+# spacing of the smooth fields of a light field camera over its grid: fine and coarse range noise,
+# missing texture, mismatches, and two of jitter
+_FIELDS = (1.0, 4.0, 2.0, 1.0, 1.5, 1.5)
+
 _TABLE_BITS = 13
 _SHIFT = 64 - _TABLE_BITS
 
 
-def _normal_table() -> np.ndarray:
-    """Quantiles of the standard normal distribution at 2^13 evenly spaced probabilities."""
-    from statistics import NormalDist
-
-    n = 1 << _TABLE_BITS
-    return np.array([NormalDist().inv_cdf((k + 0.5) / n) for k in range(n)], np.float32)
-
-
-NORMAL = _normal_table()
+# quantiles of the standard normal distribution at 2^13 evenly spaced probabilities
+_PROBABILITIES = (np.arange(1 << _TABLE_BITS) + 0.5) / (1 << _TABLE_BITS)
+NORMAL = np.array([NormalDist().inv_cdf(p) for p in _PROBABILITIES], np.float32)
 
 
 @inner_kernel()
@@ -181,14 +185,9 @@ def soften(depth, what, p, state, table, field):
 def _outside(depth, what, v, u):
     """The farthest of the four neighbours that are not the animal, 0 if all are."""
     far = np.float32(0.0)
-    if what[v - 1, u] != ANIMAL:
-        far = max(far, depth[v - 1, u])
-    if what[v + 1, u] != ANIMAL:
-        far = max(far, depth[v + 1, u])
-    if what[v, u - 1] != ANIMAL:
-        far = max(far, depth[v, u - 1])
-    if what[v, u + 1] != ANIMAL:
-        far = max(far, depth[v, u + 1])
+    for dv, du in _NEIGHBOURS:
+        if what[v + dv, u + du] != ANIMAL:
+            far = max(far, depth[v + dv, u + du])
     return far
 
 
@@ -198,14 +197,13 @@ def _step(depth, v, u):
     height, width = depth.shape
     here = depth[v, u]
     worst = np.float32(0.0)
-    if v > 0 and depth[v - 1, u] > 0 and abs(depth[v - 1, u] - here) > abs(worst):
-        worst = depth[v - 1, u] - here
-    if v < height - 1 and depth[v + 1, u] > 0 and abs(depth[v + 1, u] - here) > abs(worst):
-        worst = depth[v + 1, u] - here
-    if u > 0 and depth[v, u - 1] > 0 and abs(depth[v, u - 1] - here) > abs(worst):
-        worst = depth[v, u - 1] - here
-    if u < width - 1 and depth[v, u + 1] > 0 and abs(depth[v, u + 1] - here) > abs(worst):
-        worst = depth[v, u + 1] - here
+    for dv, du in _NEIGHBOURS:
+        row = v + dv
+        column = u + du
+        if 0 <= row < height and 0 <= column < width and depth[row, column] > 0:
+            step = depth[row, column] - here
+            if abs(step) > abs(worst):
+                worst = step
     return worst
 
 
@@ -270,10 +268,10 @@ def _shadow(row, fb, side, shadow):
         u = width - 1 - k if side > 0 else k
         shadow[u] = False
         if row[u] > 0:
-            seen = (u if side > 0 else -u) - fb / row[u]
+            visible = (u if side > 0 else -u) - fb / row[u]
             # tolerance: slopes at a grazing angle are not a shadow's edge
-            shadow[u] = seen > front + 0.7
-            front = min(front, seen)
+            shadow[u] = visible > front + 0.7
+            front = min(front, visible)
 
 
 @inner_kernel()
@@ -338,19 +336,15 @@ def light_field(depth, what, p, state, table, out):
         out: (H, W) uint16 in steps of `p[UNIT]` mm, output, 0 = unread.
     """
     height, width = depth.shape
-    fields = np.empty((6, height, width), np.float32)
+    fields = np.empty((len(_FIELDS), height, width), np.float32)
     fine = fields[0]
     coarse = fields[1]
     blank = fields[2]
     wrong = fields[3]
     move_u = fields[4]
     move_v = fields[5]
-    smooth_field(state, table, p[GRID], fine)
-    smooth_field(state, table, 4.0 * p[GRID], coarse)
-    smooth_field(state, table, 2.0 * p[GRID], blank)
-    smooth_field(state, table, 1.0 * p[GRID], wrong)
-    smooth_field(state, table, 1.5 * p[GRID], move_u)
-    smooth_field(state, table, 1.5 * p[GRID], move_v)
+    for k in range(len(fields)):
+        smooth_field(state, table, _FIELDS[k] * p[GRID], fields[k])
     strength = p[NOISE]
     jitter = np.float32(p[JITTER])
     per_mm = 1.0 / TYPICAL_MM

@@ -15,8 +15,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body._skinning_kernels import joined_faces
 from liex_lab.optics.camera import Camera
-from liex_lab.simulation.scene import N_PARTS, THING_FACES, SimulatedScene, draw_thing, rounded
+from liex_lab.simulation.scene import (
+    N_PARTS,
+    OBJECT_FACES,
+    SPHERE_TUBE,
+    SimulatedScene,
+    draw_object,
+    mesh_of,
+)
 
 Array = NDArray[np.float64]
 Beside = Callable[
@@ -48,7 +56,7 @@ _HELD = (0.08, 0.3)
 _HELD_ASIDE = (0.1, 0.5)
 _AWAY = np.array([0.0, 0.0, 1e6])  # behind the camera
 
-TWO_FACES = np.concatenate([THING_FACES, THING_FACES + np.int32(THING_FACES.max() + 1)])
+TWO_FACES = joined_faces([SPHERE_TUBE] * (2 * N_PARTS))
 
 
 @dataclass(frozen=True)
@@ -122,7 +130,7 @@ def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArra
     return times
 
 
-def draw_things(
+def draw_objects(
     rng: np.random.Generator,
     events: list[Event],
     eye: Array,
@@ -146,15 +154,15 @@ def draw_things(
     Returns:
         (n, 2 V, 3) mm, arena frame: the occluder's vertices, then the second object's.
     """
-    one = int(THING_FACES.max()) + 1
-    things = np.tile(eye + _AWAY, (len(joints), 2 * one, 1))
+    one = int(OBJECT_FACES.max()) + 1
+    objects = np.tile(eye + _AWAY, (len(joints), 2 * one, 1))
     for event in events:
         span = slice(event.start, event.stop)
         if event.kind == "occluder":
-            things[span, :one] = _passing(rng, eye, joints[span], length_mm, floats)
+            objects[span, :one] = _passing(rng, eye, joints[span], length_mm, floats)
         elif event.kind == "object":
-            things[span, one:] = beside(rng, joints[span], length_mm)
-    return things
+            objects[span, one:] = beside(rng, joints[span], length_mm)
+    return objects
 
 
 def _passing(
@@ -167,18 +175,10 @@ def _passing(
     over = eye[:2] + (target[:2] - eye[:2]) * share
     direction = rng.uniform(-np.pi, np.pi)
     half = rng.uniform(*_BAR_HALF) * length_mm * share
-    s = np.linspace(-1.0, 1.0, len(joints))
-    centre = np.zeros((N_PARTS, 3))
-    radii = np.zeros((N_PARTS, 3))
-    radii[0] = [half, _BAR_LONG * length_mm * share, 0.1 * length_mm]
-    mesh = rounded(centre, radii, np.full(N_PARTS, direction), np.full(N_PARTS, 8.0)).reshape(-1, 3)
-    along = (
-        s[:, None]
-        * _BAR_FROM
-        * length_mm
-        * share
-        * np.array([np.cos(direction), np.sin(direction)])
-    )
+    sides = [half, _BAR_LONG * length_mm * share, 0.1 * length_mm]
+    mesh = mesh_of([(np.zeros(3), sides, direction, 8.0)])
+    s = np.linspace(-1.0, 1.0, len(joints))[:, None] * _BAR_FROM * length_mm * share
+    along = s * np.array([np.cos(direction), np.sin(direction)])
     place = np.concatenate([over + along, np.full((len(s), 1), height)], axis=1)
     return mesh + place[:, None]
 
@@ -200,12 +200,12 @@ def beside_animal(
         scene: the scene with its walls.
         joints: (n, J, 3) of the animal during the event, mm, arena frame.
         length_mm: of the animal, mm.
-        kinds: kinds of objects to choose from, see `scene.draw_thing`.
+        kinds: kinds of objects to choose from, see `scene.draw_object`.
 
     Returns:
         (n, V, 3) mm, arena frame, the same in every frame.
     """
-    mesh = draw_thing(rng, str(rng.choice(kinds)), length_mm)
+    mesh = draw_object(rng, str(rng.choice(kinds)), length_mm)
     path = joints[..., :2].reshape(-1, 2)
     best = np.zeros(2)
     best_cost = np.inf
@@ -235,20 +235,13 @@ def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Ar
     Returns:
         (n, V, 3) mm, arena frame, the same in every frame.
     """
-    centre = np.zeros((N_PARTS, 3))
-    radii = np.zeros((N_PARTS, 3))
-    radii[0] = rng.uniform(*_HELD, 3) * length_mm
-    power = np.full(N_PARTS, rng.choice([2.0, 8.0]))
-    mesh = rounded(centre, radii, np.full(N_PARTS, rng.uniform(-np.pi, np.pi)), power).reshape(
-        -1, 3
-    )
+    radii = rng.uniform(*_HELD, 3) * length_mm
+    power = rng.choice([2.0, 8.0])
+    mesh = mesh_of([(np.zeros(3), radii, rng.uniform(-np.pi, np.pi), power)])
     direction = rng.uniform(-np.pi, np.pi)
     toward = np.array([np.cos(direction), np.sin(direction)])
-    reach = (
-        (joints[..., :2] @ toward).max()
-        + np.hypot(*radii[0, :2])
-        + rng.uniform(*_HELD_ASIDE) * length_mm
-    )
+    reach = (joints[..., :2] @ toward).max() + np.hypot(*radii[:2])
+    reach += rng.uniform(*_HELD_ASIDE) * length_mm
     middle = joints.mean(axis=(0, 1))
     place = np.array([*(middle[:2] + (reach - middle[:2] @ toward) * toward), middle[2]])
     return np.broadcast_to(mesh + place, (len(joints), *mesh.shape))
@@ -305,12 +298,8 @@ class Loss:
                 for i in range(event.start, event.stop):
                     centres = joints[i, rng.integers(joints.shape[1], size=int(rng.integers(2, 5)))]
                     centres = centres + rng.normal(0.0, 0.1 * length_mm, centres.shape)
-                    px = (
-                        camera.fx
-                        / centres[:, 2:]
-                        * rng.uniform(*_HOLE, (len(centres), 1))
-                        * length_mm
-                    )
+                    share = rng.uniform(*_HOLE, (len(centres), 1))
+                    px = camera.fx / centres[:, 2:] * share * length_mm
                     discs[i] = np.concatenate([camera.project(centres), px], axis=1)
         return Loss(tuple(discs), faint, dropout)
 
@@ -350,7 +339,9 @@ class Loss:
                 depth[np.hypot(u - u0, v - v0) < radius] = 0.0
 
 
-def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[np.int64]) -> Array:
+def visible_share(
+    vertices: Array, objects: Array, camera: Camera, rows: NDArray[np.int64]
+) -> Array:
     """Share of the animal's vertices that are not occluded, 1 in frames other than `rows`.
 
     A vertex counts as occluded if it projects into the convex hull of the occluder's projection, as
@@ -358,7 +349,7 @@ def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[
 
     Args:
         vertices: (n, V, 3) of the animal, mm, camera frame.
-        things: (n, W, 3) of the occluder, mm, camera frame.
+        objects: (n, W, 3) of the occluder, mm, camera frame.
         camera: the camera.
         rows: frames with an occluder.
 
@@ -369,7 +360,7 @@ def visible_share(vertices: Array, things: Array, camera: Camera, rows: NDArray[
 
     share = np.ones(len(vertices))
     for i in rows:
-        shadow = camera.project(things[i])
+        shadow = camera.project(objects[i])
         animal = camera.project(vertices[i])
         share[i] = 1.0 - float((Delaunay(shadow).find_simplex(animal) >= 0).mean())
     return share

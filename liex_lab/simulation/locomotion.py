@@ -1,4 +1,4 @@
-"""Locomotion models of a walking mouse and a swimming fish: random walks in an arena.
+"""Locomotion models of a walking mouse, a swimming fish and any animal: random walks in an arena.
 
 Headings follow a correlated random walk, an AR(1) turning rate or a script of turns, with a pull
 towards the centre that grows near walls; a step that would leave the arena is rejected. Postures
@@ -11,18 +11,38 @@ while it scoots, glides, turns, rises, dives and rests.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
+from liex_lab.body.shape import Body, BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.simulation.fish import FishSpecies, bend_profile, clearance, hung
-from liex_lab.simulation.pose_prior import KINDS, Posture, draw_postures, root_rotation, stand
+from liex_lab.simulation.pose_prior import (
+    FRONT,
+    KINDS,
+    Posture,
+    bend_profile,
+    centred,
+    clearance,
+    draw_angles,
+    draw_postures,
+    hung,
+    root_rotation,
+    stand,
+)
 from liex_lab.simulation.recording import SyntheticSession, assemble
 from liex_lab.simulation.scene import SimulatedScene, floor_point
-from liex_lab.simulation.species import KINECT_V2_SENSOR, RAYTRIX_R5_SENSOR, MouseSpecies, Sensor
+from liex_lab.simulation.species import (
+    NEAR_SHARE,
+    NEAREST_MM,
+    FishSpecies,
+    GenericSpecies,
+    MouseSpecies,
+    Sensor,
+    Species,
+)
 
 Array = NDArray[np.float64]
 Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]
@@ -42,7 +62,6 @@ _STRETCHES = {
 _BLEND_S = 0.12  # time constant of the blend between postures
 _STRIDE_HZ_PER_SPINE = 1.6
 
-_NEAREST_MM = 180.0  # smallest distance to the camera
 # durations of beating, and of gliding or resting in between
 _BOUT_S = (0.15, 0.6)
 _REST_S = (0.1, 1.2)
@@ -55,68 +74,76 @@ _TURN_RAD_S = (4.0, 16.0)
 _TURN_S = 0.14
 _BEND_PER_TURN = 0.55  # degrees per joint for each rad/s of turning
 _CLIMB_RAD = np.radians(25.0)
+_CHANGE_S = 0.5  # mean duration of a posture of an animal of any kind
 
 
-def walking_session(
+def moving_session(
+    species: Species,
     seed: int | list[int],
     n_frames: int,
     *,
-    sensor: Sensor = KINECT_V2_SENSOR,
+    sensor: Sensor | None = None,
     family: str = "train",
     noise: float = 1.0,
     erosion_px: int = 0,
-    thing_share: float = 0.0,
+    object_share: float = 0.0,
     spine_mm: float | None = None,
-    species: MouseSpecies | None = None,
-    name: str = "walking",
+    name: str = "",
 ) -> SyntheticSession:
-    """A recording of one mouse that moves around at 30 frames/s, drawn from the seed.
+    """A recording of one animal that moves around, drawn from the seed.
+
+    A mouse walks, turns, rears and curls up, a fish swims in bouts; any other animal moves around
+    and changes its posture.
 
     Args:
+        species: of the animal.
         seed: seed or seeds of all random numbers.
-        n_frames: length of the recording.
-        sensor: the camera's make.
-        family: of body shapes, see `draw_shapes`.
+        n_frames: length of the recording, at the species' rate.
+        sensor: the camera's make; None is the species' last.
+        family: of body shapes, see `body.variation`.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
-        thing_share: share of frames with a distractor.
+        object_share: share of frames with a distractor.
         spine_mm: length of the animal, mm; None draws it.
-        species: the species; None is the preset mouse.
-        name: of the recording.
+        name: of the recording; '' is its kind of locomotion.
 
     Returns:
         The recording with its truth.
     """
     rng = np.random.default_rng(seed)
-    species = MouseSpecies() if species is None else species
-    skeleton = species.skeleton
-    spine = (
-        skeleton.length * float(rng.uniform(*species.sizes))
-        if spine_mm is None
-        else float(spine_mm)
-    )
-    scene = SimulatedScene.draw(rng, sensor.camera, spine)
+    sensor = sensor or species.sensors[-1]
+    if spine_mm is None:
+        spine_mm = species.skeleton.length * float(rng.uniform(*species.sizes))
+    length = float(spine_mm)
+    scene = SimulatedScene.draw(rng, sensor.camera, length, species.setting)
     shape = species.shapes(rng, family, 1)
-    pose, girth = walk(rng, scene, species, shape, spine, n_frames)
+    if isinstance(species, MouseSpecies):
+        assert isinstance(shape, BodyShape)
+        kind = "walking"
+        pose, girth = walk(rng, scene, species, shape, length, n_frames)
+    elif isinstance(species, FishSpecies):
+        kind = "swimming"
+        pose, girth = _swim(rng, scene, species, shape, length, n_frames)
+    else:
+        assert isinstance(species, GenericSpecies)
+        kind = "moving"
+        pose, girth = _roam(rng, scene, species, shape, length, n_frames)
     contents = assemble(
-        rng,
-        scene,
-        sensor,
-        species,
-        spine,
-        shape,
-        pose,
-        girth,
-        noise,
-        erosion_px,
-        thing_share,
-        False,
+        rng, scene, sensor, species, length, shape, pose, girth, noise, erosion_px, object_share
     )
-    assert contents.bends is not None  # mice have tails
-    contents.bends[:] = contents.bends[:1] + 4.0 * _smooth(
-        rng.normal(0.0, 0.05, contents.bends.shape)
-    )
-    return SyntheticSession(name, scene, contents)
+    if contents.bends is not None:
+        steps = rng.normal(0.0, 0.05, contents.bends.shape)
+        contents.bends[:] = contents.bends[:1] + 4.0 * smoothed(steps, _BLEND_S * _RATE_HZ)
+    times = np.arange(n_frames) * species.frame_ns
+    return SyntheticSession(name or kind, scene, contents, times)
+
+
+def walking_session(seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
+    """A recording of the preset mouse, see `moving_session`."""
+    return moving_session(MouseSpecies(), seed, n_frames, **settings)
+
+
+# Walking.
 
 
 def walk(
@@ -162,8 +189,8 @@ def walk(
         posture,
         heading,
         np.full(n_frames, spine_mm / skeleton.length),
-        shape[0].broadcast(n_frames),
-        _smooth(rng.uniform(0.0, 3.0, n_frames)[:, None])[:, 0],
+        body,
+        smoothed(rng.uniform(0.0, 3.0, n_frames), _BLEND_S * _RATE_HZ),
     )
     middle = pose.joints(skeleton)[..., :2].mean(axis=1)
     pose.root.translation[:, :2] += position - middle
@@ -182,19 +209,15 @@ def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
     at = 0
     while at < n:
         if not deck:  # used up before it is shuffled again, so that no kind is absent for long
-            deck = [
-                int(k)
-                for k in rng.permutation(
-                    np.repeat(range(len(KINDS)), [_STRETCHES[k][0] for k in range(5)])
-                )
-            ]
+            cards = np.repeat(range(len(KINDS)), [_STRETCHES[k][0] for k in range(len(KINDS))])
+            deck = rng.permutation(cards).tolist()
         kind = deck.pop()
         _, shortest, longest, (slow, fast) = _STRETCHES[kind]
         stop = at + int(_RATE_HZ * rng.uniform(shortest, longest))
         kinds[at:stop] = kind
         speed[at:stop] = rng.uniform(slow, fast)
         at = stop
-    return kinds, np.maximum(_smooth(speed[:, None])[:, 0], 0.0)
+    return kinds, np.maximum(smoothed(speed, _BLEND_S * _RATE_HZ), 0.0)
 
 
 def _flow(
@@ -205,19 +228,8 @@ def _flow(
     n = len(kinds)
     change = np.concatenate([[True], (kinds[1:] != kinds[:-1]) | (rng.random(n - 1) < 0.04)])
     keep = np.maximum.accumulate(np.where(change, np.arange(n), 0))
-    rows = [drawn.elevation, drawn.turn, drawn.roll[:, None], drawn.stretch[:, None]]
-    elevation, turn, roll, stretch = (_smooth(row[keep]) for row in rows)
-    return Posture(elevation, turn, roll[:, 0], stretch[:, 0])
-
-
-def _smooth(rows: Array) -> Array:
-    """Columns of (n, k) convolved with a Gaussian of _BLEND_S, with constant extension."""
-    reach = int(4 * _BLEND_S * _RATE_HZ)
-    bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / (_BLEND_S * _RATE_HZ)) ** 2)
-    padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
-    return np.stack(
-        [np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1
-    )
+    columns = (drawn.elevation, drawn.turn, drawn.roll, drawn.stretch)
+    return Posture(*(smoothed(column[keep], _BLEND_S * _RATE_HZ) for column in columns))
 
 
 def free_path(
@@ -266,49 +278,21 @@ def free_path(
     return position, heading
 
 
-def swimming_session(
-    seed: int | list[int],
+# Swimming, and moving as any animal.
+
+
+def _swim(
+    rng: np.random.Generator,
+    scene: SimulatedScene,
+    species: FishSpecies,
+    shape: Body,
+    length: float,
     n_frames: int,
-    *,
-    sensor: Sensor = RAYTRIX_R5_SENSOR,
-    family: str = "train",
-    noise: float = 1.0,
-    erosion_px: int = 0,
-    thing_share: float = 0.0,
-    spine_mm: float | None = None,
-    species: FishSpecies | None = None,
-    name: str = "swimming",
-) -> SyntheticSession:
-    """A recording of one fish that swims in bouts at 50 frames/s, drawn from the seed.
-
-    Args:
-        seed: seed or seeds of all random numbers.
-        n_frames: length of the recording.
-        sensor: the camera's make.
-        family: of body shapes, see `vary_body`.
-        noise: multiplies the sensor's random errors and its rate of holes.
-        erosion_px: pixels stripped off the animal's outline.
-        thing_share: share of frames with a distractor.
-        spine_mm: length of the fish, mm; None draws it.
-        species: the species; None is the preset zebrafish.
-        name: of the recording.
-
-    Returns:
-        The recording with its truth.
-    """
-    rng = np.random.default_rng(seed)
-    species = FishSpecies() if species is None else species
+) -> tuple[Pose, Array]:
+    """The motion of one fish, and its girths."""
     skeleton = species.skeleton
-    length = (
-        skeleton.length * float(rng.uniform(*species.sizes))
-        if spine_mm is None
-        else float(spine_mm)
-    )
-    scene = SimulatedScene.draw(rng, sensor.camera, length, species.setting)
-    shape = species.shapes(rng, family, 1)
     step_s = species.frame_ns * 1e-9
     speed, turning, amplitude, beat = _swim_script(rng, n_frames, step_s)
-    middle = np.full(n_frames, 0.47)
     # turns and waves run from head to tail
     hind = np.concatenate([np.zeros(2), turning[:-2]]) if n_frames > 2 else turning
     yaw = bend_profile(
@@ -318,40 +302,54 @@ def swimming_session(
         amplitude,
         beat,
         np.ones(n_frames),
-        middle,
+        np.full(n_frames, FRONT),
         smoothed(rng.normal(0.0, 0.8, (n_frames, 4)), 6.0),
     )
     size = np.full(n_frames, length / skeleton.length)
-    pitch = _CLIMB_RAD * np.tanh(smoothed(rng.normal(0.0, 6.0, (n_frames, 1)), 25.0)[:, 0])
-    roll = np.radians(smoothed(rng.normal(0.0, 12.0, (n_frames, 1)), 8.0)[:, 0])
+    pitch = _CLIMB_RAD * np.tanh(smoothed(rng.normal(0.0, 6.0, n_frames), 25.0))
+    roll = np.radians(smoothed(rng.normal(0.0, 12.0, n_frames), 8.0))
     level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
     low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
-    top = max(
-        float(scene.T_arena_camera.translation[2]) - _NEAREST_MM - float(high.max()),
-        float(low.max()) + 2.0,
-    )
-    position, heading = wander(
-        rng, scene, length, speed, turning, pitch, (float(low.max()) + 0.5, top), step_s
-    )
+    camera_mm = float(scene.T_arena_camera.translation[2])
+    top = max(camera_mm - NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
+    water = (float(low.max()) + 0.5, top)
+    position, heading = wander(rng, scene, length, speed, turning, pitch, water, step_s)
     pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
     pose.root.translation[:] += position
-    contents = assemble(
-        rng,
-        scene,
-        sensor,
-        species,
-        length,
-        shape,
-        pose,
-        size,
-        noise,
-        erosion_px,
-        thing_share,
-        False,
-    )
-    return SyntheticSession(
-        name, scene, contents, np.arange(n_frames, dtype=np.int64) * species.frame_ns
-    )
+    return pose, size
+
+
+def _roam(
+    rng: np.random.Generator,
+    scene: SimulatedScene,
+    species: GenericSpecies,
+    shape: Body,
+    length: float,
+    n_frames: int,
+) -> tuple[Pose, Array]:
+    """The motion of one animal of any kind, and its girths."""
+    skeleton = species.skeleton
+    step_s = species.frame_ns * 1e-9
+    size = np.full(n_frames, length / skeleton.length)
+    slow = _CHANGE_S / step_s
+    starts = np.where(rng.random(n_frames) < 1.0 / slow, np.arange(n_frames), 0)
+    drawn = draw_angles(rng, skeleton, n_frames)[np.maximum.accumulate(starts)]
+    angles = smoothed(drawn.reshape(n_frames, -1), 0.4 * slow).reshape(drawn.shape)
+    speed = np.maximum(smoothed(rng.normal(0.4, 0.8, n_frames), slow), 0.0)
+    turning = smoothed(rng.normal(0.0, 3.0, n_frames), slow)
+    level = np.zeros(n_frames)
+    flat = centred(skeleton, angles, root_rotation(level, level, level), size)
+    low, high = species.extent(flat, shape[0].broadcast(n_frames), size)
+    least = -float(low.min()) + 1.0
+    camera_mm = float(scene.T_arena_camera.translation[2])
+    top = NEAR_SHARE * camera_mm - float(high.max()) if species.floats else 0.0
+    water = (least, max(top, least))
+    position, heading = wander(rng, scene, length, speed, turning, level, water, step_s)
+    pose = centred(skeleton, angles, root_rotation(heading, level, level), size)
+    pose.root.translation[:] += position
+    if not species.floats:
+        pose.root.translation[:, 2] -= position[:, 2] + low
+    return pose, size
 
 
 def _swim_script(
@@ -380,14 +378,10 @@ def _swim_script(
         speed[stop : stop + resting] = pace * np.exp(-(glide + 1) * step_s / _GLIDE_S)
         pace *= float(np.exp(-resting * step_s / _GLIDE_S))
         at = stop + resting
-    turning = (
-        smoothed(turning[:, None], 1.2)[:, 0] + smoothed(rng.normal(0.0, 3.0, (n, 1)), 12.0)[:, 0]
-    )
-    amplitude = smoothed(amplitude[:, None], 2.0)[:, 0]
     return (
-        smoothed(speed[:, None], 1.5)[:, 0],
-        turning,
-        amplitude,
+        smoothed(speed, 1.5),
+        smoothed(turning, 1.2) + smoothed(rng.normal(0.0, 3.0, n), 12.0),
+        smoothed(amplitude, 2.0),
         2 * np.pi * np.cumsum(rate) * step_s,
     )
 
@@ -421,9 +415,8 @@ def wander(
         Positions (n, 3) of the body's centre, mm, arena frame, and headings (n,) rad.
     """
     n = len(speed)
-    centre = scene.camera.unproject(
-        [(scene.camera.width - 1) / 2, (scene.camera.height - 1) / 2], 1.0
-    )
+    camera = scene.camera
+    centre = camera.unproject([(camera.width - 1) / 2, (camera.height - 1) / 2], 1.0)
     ray = scene.T_arena_camera.rotation @ centre
     low, high = water
     z = rng.uniform(low, high)
@@ -452,7 +445,7 @@ def wander(
 
 
 def smoothed(rows: Array, frames: float) -> Array:
-    """Columns convolved with a Gaussian kernel, with the end values extended.
+    """Columns, or one, convolved with a Gaussian kernel, with the end values extended.
 
     Args:
         rows: (n, k) samples.
@@ -461,9 +454,10 @@ def smoothed(rows: Array, frames: float) -> Array:
     Returns:
         (n, k).
     """
+    if rows.ndim == 1:
+        return smoothed(rows[:, None], frames)[:, 0]
     reach = int(4 * frames)
     bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
+    bell /= bell.sum()
     padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
-    return np.stack(
-        [np.convolve(column, bell / bell.sum(), mode="valid") for column in padded.T], axis=-1
-    )
+    return np.stack([np.convolve(column, bell, mode="valid") for column in padded.T], axis=-1)

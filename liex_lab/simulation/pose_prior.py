@@ -1,9 +1,17 @@
-"""Pose prior of a mouse-like animal: a mixture of five kinds of posture on the floor.
+"""Pose priors: postures of mice on the floor, bends of fish, joint angles of any animal.
 
-A posture is drawn as bone elevations and turns: walking, curled up, reared up, hunched or reaching
-(`KINDS`, with the weights `SHARES`). It is then placed on the plane z = 0 by forward kinematics:
-the rear of the trunk touches the floor, and if the front would be below it, the animal is tilted up
-around its rump (`stand`). Stretch preserves volume: girth is size / sqrt(stretch).
+A mouse's posture is drawn as bone elevations and turns: walking, curled up, reared up, hunched or
+reaching (`KINDS`, with the weights `SHARES`). It is then placed on the plane z = 0 by forward
+kinematics: the rear of the trunk touches the floor, and if the front would be below it, the animal
+is tilted up around its rump (`stand`). Stretch preserves volume: girth is size / sqrt(stretch).
+
+A fish's yaw at arc length s (0 at the base joint, 1 at the end of the chain) consists of two arcs,
+joined by a logistic step, plus a travelling wave whose amplitude grows along the body, A (0.35 +
+0.65 s) sin(2 pi s / L - phase), plus four small standing waves (`bend_profile`).
+
+Any other animal's joint angles are drawn by a Gaussian copula: a standard normal number follows an
+AR(1) process down every chain (correlation 0.75 with the parent's), and its quantile sets the
+joint's position between its limits (`draw_angles`).
 """
 
 from __future__ import annotations
@@ -16,7 +24,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import chain_arc, spine_frame
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
+from liex_lab.body.shape import Body, BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.kernels import kernel
@@ -52,33 +60,26 @@ class Posture:
 def sample_postures(
     rng: np.random.Generator,
     skeleton: Skeleton,
-    n: int,
-    size: Array | float = 1.0,
-    shape: BodyShape | None = None,
-    kinds: NDArray[np.int64] | None = None,
+    size: Array,
+    shape: BodyShape,
+    kinds: NDArray[np.int64],
 ) -> tuple[Pose, Array]:
     """Poses in the arena frame, rump above the origin, headings uniform, and their girths.
 
-    A stretched animal is thinner, a compressed one fatter.
-
     Args:
         rng: random number generator.
-        skeleton: of the animal.
-        n: number of postures.
-        size: (n,) of the animals over home size, or one for all.
-        shape: (n) their bodies; None is the default one.
-        kinds: (n,) int64, indices into `KINDS`; None draws them by `SHARES`.
+        skeleton: of the mouse.
+        size: (n,) over home size, before the spine is stretched.
+        shape: the bodies, a batch (n).
+        kinds: (n,) int64, indices into `KINDS`.
 
     Returns:
-        Poses (n) and girths (n,).
+        Poses (n) and girths (n,): factors of all lengths across the body.
     """
-    bodies = (BodyShape.default(skeleton) if shape is None else shape).broadcast(n)
-    size = np.broadcast_to(np.asarray(size, float), (n,))
-    if kinds is None:
-        kinds = rng.choice(len(KINDS), n, p=SHARES)
-    posture = draw_postures(rng, skeleton, kinds, bodies)
+    n = len(kinds)
+    posture = draw_postures(rng, skeleton, kinds, shape)
     heading = rng.uniform(-np.pi, np.pi, n)
-    return stand(skeleton, posture, heading, size, bodies, rng.uniform(0.0, _MAX_GAP_MM, n))
+    return stand(skeleton, posture, heading, size, shape, rng.uniform(0.0, _MAX_GAP_MM, n))
 
 
 def draw_postures(
@@ -148,10 +149,8 @@ def _draw_turns(
     total = np.radians(rng.uniform(30.0, 100.0, (n, 1))) * rng.choice([-1.0, 1.0], (n, 1))
     curl = total * rng.dirichlet(np.full(inner, 3.0), n) + 0.5 * slight
     turn[:, 1:-1] = np.where(curled, curl, slight)
-    head = np.radians(
-        np.where(reaching[:, 0], rng.uniform(-60.0, 60.0, n), rng.normal(0.0, 10.0, n))
-    )
-    turn[:, -2] += head
+    head = np.where(reaching[:, 0], rng.uniform(-60.0, 60.0, n), rng.normal(0.0, 10.0, n))
+    turn[:, -2] += np.radians(head)
     return turn
 
 
@@ -166,8 +165,8 @@ def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
         (n, J) mm at scale 1.
     """
     stations = np.asarray(skeleton.surface["stations"], float)
-    reach = np.concatenate([[0.0], np.cumsum(np.linalg.norm(skeleton.offsets[1:], axis=1))])
-    return np.stack([np.interp(reach / reach[-1], stations, high) for high in shape.half_height])
+    along = skeleton.reach / skeleton.length
+    return np.stack([np.interp(along, stations, high) for high in shape.half_height])
 
 
 def stand(
@@ -265,3 +264,185 @@ def _lowest_points(joints, rotations, girth, stations, half_width, half_height, 
             side = girth[i] * half_width[i, r] * frame[2, 2]
             rise = girth[i] * half_height[i, r] * frame[3, 2]
             out[i, r] = frame[0, 2] - np.sqrt(side * side + rise * rise)
+
+
+# Fish: travelling waves of bending.
+
+
+# at rest or gliding; scooting with waves down the body; J: the hind half bent, C: both halves, S:
+# in opposite directions
+FISH_KINDS = ("glide", "scoot", "j", "c", "s")
+FISH_SHARES = (0.28, 0.30, 0.14, 0.14, 0.14)
+FRONT = 0.47  # front arc's share of the body (as in human annotations)
+
+
+def draw_bends(rng: np.random.Generator, skeleton: Skeleton, kind: NDArray[np.int64]) -> Array:
+    """Yaw at each joint for kinds of posture, within the skeleton's limits.
+
+    Two arcs, a wave that travels down the body, and small independent bends. Degrees are those of a
+    chain of 20 bones; the hind half bends about twice as much as the front half, up to some 7
+    degrees per joint in a turn.
+
+    Args:
+        rng: random number generator.
+        skeleton: of the fish.
+        kind: (n,) int64, indices into `FISH_KINDS`.
+
+    Returns:
+        (n, J) rad.
+    """
+    n = len(kind)
+    side = rng.choice([-1.0, 1.0], n)
+    slight = rng.normal(0.0, 1.0, (2, n)) * [[0.6], [1.2]]
+    strong = rng.uniform(0.0, 1.0, (2, n))
+    front = np.choose(
+        kind,
+        [
+            slight[0],
+            1.2 * slight[0],
+            1.2 * slight[0],
+            side * (2 + 7 * strong[0]),
+            side * (1.5 + 5 * strong[0]),
+        ],
+    )
+    hind = np.choose(
+        kind,
+        [
+            slight[1],
+            1.5 * slight[1],
+            side * (2.5 + 6.5 * strong[1]),
+            side * (1.5 + 9 * strong[1]),
+            -side * (2 + 6.5 * strong[1]),
+        ],
+    )
+    amplitude = np.choose(
+        kind, [0.4, 1.0 + 5.0 * strong[0], 1.5 * strong[0], 1.5 * strong[0], 2.0 * strong[0]]
+    )
+    phase = rng.uniform(-np.pi, np.pi, n)
+    length = rng.uniform(0.7, 1.4, n)
+    middle = rng.normal(FRONT, 0.06, n)
+    own = rng.normal(0.0, 0.5, (n, 4))
+    return bend_profile(skeleton, front, hind, amplitude, phase, length, middle, own)
+
+
+def bend_profile(
+    skeleton: Skeleton,
+    front: Array,
+    hind: Array,
+    amplitude: Array,
+    phase: Array,
+    length: Array,
+    middle: Array,
+    own: Array,
+) -> Array:
+    """Yaw at each joint of two arcs with a travelling wave.
+
+    With s the joint's share of the body's length, the arcs join in a logistic step of width 0.05 at
+    `middle`; the wave is amplitude (0.35 + 0.65 s) sin(2 pi s / length - phase).
+
+    Args:
+        skeleton: of the fish; only joints with a yaw axis bend, within their limits.
+        front: (n,) bend of the front arc, degrees per joint of 20.
+        hind: (n,) bend of the hind arc, degrees per joint of 20.
+        amplitude: (n,) of the travelling wave, degrees per joint of 20.
+        phase: (n,) of the travelling wave, rad.
+        length: (n,) of the travelling wave, over the body's length.
+        middle: (n,) position where the arcs meet, over the body's length.
+        own: (n, 4) amplitudes of standing waves, degrees per joint of 20.
+
+    Returns:
+        (n, J) rad, 0 at the base joint.
+    """
+    s = skeleton.reach / skeleton.length
+    joint = 20.0 / max(1, skeleton.n_joints - 1)
+    share = 1.0 / (1.0 + np.exp(-(s - middle[:, None]) / 0.05))
+    arcs = front[:, None] * (1.0 - share) + hind[:, None] * share
+    wave = (
+        amplitude[:, None]
+        * (0.35 + 0.65 * s)
+        * np.sin(2 * np.pi * s / length[:, None] - phase[:, None])
+    )
+    stand = np.stack([np.sin(np.pi * (k + 1) * s + k) for k in range(own.shape[1])])
+    yaw = np.radians((arcs + wave + own @ stand) * joint) * skeleton.axes[:, 2]
+    yaw[:, 0] = 0.0
+    return np.clip(yaw, skeleton.limits[:, 2, 0], skeleton.limits[:, 2, 1])
+
+
+def hung(skeleton: Skeleton, yaw: Array, rotation: Array, size: Array) -> Pose:
+    """Poses with given bends and orientations and the mean of their joints at the origin.
+
+    Args:
+        skeleton: of the animal.
+        yaw: (n, J) bend at each joint, rad.
+        rotation: (n, 3, 3) of the base joint, arena frame.
+        size: (n,) over home size.
+
+    Returns:
+        Poses (n) in the arena frame.
+    """
+    angles = np.zeros((*yaw.shape, 3))
+    angles[..., 2] = yaw
+    return centred(skeleton, angles, rotation, size)
+
+
+def clearance(skeleton: Skeleton, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
+    """Upper bounds of the extent of bodies below and above the origin.
+
+    Args:
+        skeleton: of the animal.
+        pose: (n) around the origin.
+        shape: (n) their bodies, `BodyShape`.
+        size: (n,) over home size.
+
+    Returns:
+        Extent below (n,) and above (n,), mm.
+    """
+    assert isinstance(shape, BodyShape)
+    z = pose.joints(skeleton)[..., 2]
+    thick = size * shape.half_height.max(axis=-1)
+    return thick - z.min(axis=1), thick + z.max(axis=1)
+
+
+# Any animal: joint angles by a Gaussian copula over the kinematic tree.
+
+
+_LIKE_NEXT = 0.75  # correlation of a joint's bend with its parent's
+_UNLIMITED_RAD = np.radians(100.0)  # an axis with a wider range counts as unlimited
+_USUAL_RAD = np.radians(45.0)  # and turns by this much
+
+
+def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
+    """Joint angles about the free axes, within the limits, correlated with the parent's.
+
+    A standard normal number follows an AR(1) process down every chain; its quantile sets the
+    joint's position between its limits. A factor from a beta distribution pulls each body towards
+    its home pose, so that some are nearly straight. An axis whose range is wider than 200 degrees
+    counts as unlimited and turns by up to 45 degrees either way.
+
+    Returns:
+        (n, J, 3) rad, 0 at the base joint.
+    """
+    from scipy.special import ndtr
+
+    low, high = np.moveaxis(skeleton.limits, -1, 0)
+    wide = high - low > 2.0 * _UNLIMITED_RAD
+    low = np.where(wide, -_USUAL_RAD, low)
+    high = np.where(wide, _USUAL_RAD, high)
+    bent = rng.beta(1.2, 1.0, (n, 1, 1))  # deviation of this body from its home pose
+    number = rng.standard_normal((n, skeleton.n_joints, 3))
+    for j in range(1, skeleton.n_joints):
+        p = skeleton.parents[j]
+        if p > 0:
+            number[:, j] = _LIKE_NEXT * number[:, p] + np.sqrt(1.0 - _LIKE_NEXT**2) * number[:, j]
+    home = np.clip(0.0, low, high)
+    angles = home + bent * (low + ndtr(number) * (high - low) - home)
+    angles = angles * skeleton.axes
+    angles[:, 0] = 0.0
+    return angles
+
+
+def centred(skeleton: Skeleton, angles: Array, rotation: Array, size: Array) -> Pose:
+    """Poses (n) with their joints' mean at the origin."""
+    pose = Pose(SE3(rotation, np.zeros((len(angles), 3))), angles, np.asarray(size, float))
+    pose.root.translation[:] -= pose.joints(skeleton).mean(axis=1)
+    return pose

@@ -2,32 +2,36 @@
 
 A `SyntheticSession` ray-casts the floor and walls once, rasterises the animal's mesh frame by frame
 with a z-buffer, and passes each ideal depth image through the sensor's noise model. Frames are
-rendered on demand from a seed, in any order. `test_split` makes the fixed splits for which accuracy
-is reported: 'clean', 'hard' (twice the noise, an eroded outline, other objects), 'other-body'
+rendered on demand from a seed, in any order. `SPLITS` are the fixed splits for which accuracy is
+reported: 'clean', 'hard' (twice the noise, an eroded outline, other objects), 'other-body'
 (builds not used in training), 'other-camera' (focal lengths and resolutions not used in training),
 and the held-out split 'sealed'.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import Body
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Body, Surface
+from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
-from liex_lab.recordings.frame import Depth, DepthFrame
+from liex_lab.optics.camera import Camera
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.shapes import Rows
 from liex_lab.scene.floor import Floor
 from liex_lab.simulation import _render_kernels as render_kernels
-from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
-from liex_lab.simulation.scene import THING_FACES, SimulatedScene, draw_thing, outline_of
-from liex_lab.simulation.species import MouseSpecies, Sensor, Species, unseen
+from liex_lab.simulation._sensor_kernels import ANIMAL, NORMAL, OBJECT, UNIT
+from liex_lab.simulation.scene import OBJECT_FACES, SimulatedScene, draw_object, outline_of
+from liex_lab.simulation.species import MouseSpecies, Sensor, Species
 
 Array = NDArray[np.float64]
 
@@ -45,11 +49,11 @@ SPLITS = {
 # held-out recordings, not used in tests, training or development: evaluated once per release. They
 # are like the splits above in turn, each with its own seed
 SEALED = "sealed"
-_SEALED_SEED = 970_413
+SEALED_SEED = 970_413
 
 
 @dataclass(frozen=True)
-class FrameContents:
+class FrameContents(Rows):
     """All moving contents of n frames of a virtual camera, and the sensor's noise.
 
     Attributes:
@@ -59,24 +63,25 @@ class FrameContents:
         girth: (n,) factor of all lengths across the body.
         shape: body of the one animal.
         bends: (n, TAIL_RINGS) bends of its tail, rad; None without a separate tail.
-        things: (n, V, 3) meshes of the distractors, mm, arena frame.
+        objects: (n, V, 3) meshes of the distractors, mm, arena frame.
         shown: (n,) bool, whether the distractors are present.
         parameters: (n, N_PARAMETERS) of the sensor.
         seeds: (n,) uint64, of the sensor's noise.
-        thing_faces: (F, 3) int32, triangles of the distractors' meshes.
+        object_faces: (F, 3) int32, triangles of the distractors' meshes.
     """
 
+    SHARED = ("shape", "object_faces")
     skeleton: Skeleton
     spine_mm: float
     pose: Pose
     girth: Array
     shape: Body
     bends: Array | None
-    things: Array
+    objects: Array
     shown: NDArray[np.bool_]
     parameters: Array
     seeds: NDArray[np.uint64]
-    thing_faces: NDArray[np.int32] = field(default_factory=lambda: THING_FACES)
+    object_faces: NDArray[np.int32] = field(default_factory=lambda: OBJECT_FACES)
 
 
 class TrueRecording(Recording):
@@ -93,14 +98,46 @@ class TrueRecording(Recording):
         floor: the exact floor plane, or its substitute.
     """
 
-    skeleton: Skeleton
-    surface: Surface
-    spine_mm: float
-    pose: Pose
-    joints_camera: Array
-    joints_arena: Array
-    T_arena_camera: SE3
-    floor: Floor
+    def __init__(
+        self,
+        name: str,
+        camera: Camera,
+        times_ns: NDArray[np.int64],
+        *,
+        skeleton: Skeleton,
+        spine_mm: float,
+        pose: Pose,
+        T_arena_camera: SE3,
+        floor: Floor | None = None,
+        joints_camera: Array | None = None,
+        joints_arena: Array | None = None,
+    ) -> None:
+        """A recording with the given truth; what is None follows from the rest."""
+        super().__init__(
+            name=name,
+            format="synthetic",
+            camera=camera,
+            times_ns=times_ns,
+            read=lambda index: self.depths(index, index + 1)[0],
+        )
+        self.skeleton = skeleton
+        self.surface = Surface.of(skeleton)
+        self.spine_mm = spine_mm
+        self.pose = pose
+        self.T_arena_camera = T_arena_camera
+        self.floor = floor or Floor.from_plane(
+            -T_arena_camera.rotation[2], float(T_arena_camera.translation[2]), camera
+        )
+        self.joints_camera = pose.joints(skeleton) if joints_camera is None else joints_camera
+        self.joints_arena = (
+            T_arena_camera @ self.joints_camera if joints_arena is None else joints_arena
+        )
+
+    @property
+    def truth(self) -> dict[str, Any]:
+        """The truth as arguments of another recording of the same frames."""
+        names = ("skeleton", "spine_mm", "pose", "T_arena_camera", "floor", "joints_camera")
+        return {name: getattr(self, name) for name in (*names, "joints_arena")}
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth images of a range of frames, rendered on all threads.
@@ -132,6 +169,44 @@ class TrueRecording(Recording):
             ]
 
 
+def render_frames(
+    still: NDArray[np.float32],
+    animals: render_kernels.Part,
+    objects: render_kernels.Part,
+    camera: Camera,
+    T_arena_camera: SE3,
+    parameters: Array,
+    seeds: NDArray[np.uint64],
+) -> NDArray[np.float32]:
+    """Depth images of frames of one still scene, rendered on all threads.
+
+    Args:
+        still: (H, W) mm, the ideal still scene, 0 for nothing.
+        animals: their meshes, arena frame.
+        objects: those of all other moving objects.
+        camera: the camera.
+        T_arena_camera: its pose.
+        parameters: (n, N_PARAMETERS) of the sensor.
+        seeds: (n,) of the sensor's noise.
+
+    Returns:
+        (n, H, W) float32 mm, 0 if unread.
+    """
+    out = np.empty((len(seeds), camera.height, camera.width), np.uint16)
+    T_camera_arena = T_arena_camera.inverse()
+    render_kernels.draw_frames(
+        still,
+        animals,
+        objects,
+        np.ascontiguousarray(T_camera_arena.rotation),
+        T_camera_arena.translation,
+        camera.intrinsics,
+        render_kernels.SensorNoise(parameters, seeds, NORMAL),
+        out,
+    )
+    return out * np.float32(parameters[0, UNIT])
+
+
 class SyntheticSession(TrueRecording):
     """A virtual animal in a virtual arena, rendered on demand.
 
@@ -156,28 +231,20 @@ class SyntheticSession(TrueRecording):
             contents: the moving contents, n frames.
             times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
         """
-        n = len(contents.seeds)
-        times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
+        times = np.arange(len(contents.seeds)) * FRAME_NS if times_ns is None else times_ns
         super().__init__(
-            name=name, format="synthetic", camera=scene.camera, times_ns=times, read=self._depth
+            name,
+            scene.camera,
+            times,
+            skeleton=contents.skeleton,
+            spine_mm=contents.spine_mm,
+            pose=contents.pose.moved(scene.T_arena_camera.inverse()),
+            T_arena_camera=scene.T_arena_camera,
+            joints_arena=contents.pose.joints(contents.skeleton),
         )
         self.scene = scene
         self.contents = contents
-        self.skeleton = contents.skeleton
-        self.surface = Surface.of(contents.skeleton)
         self.shape = contents.shape
-        self.spine_mm = contents.spine_mm
-        self.T_arena_camera = scene.T_arena_camera
-        normal = -self.T_arena_camera.rotation[2]
-        self.floor = Floor.from_plane(
-            normal, float(self.T_arena_camera.translation[2]), scene.camera
-        )
-        self.pose = contents.pose.moved(self.T_arena_camera.inverse())
-        self.joints_camera = self.pose.joints(self.skeleton)
-        self.joints_arena = contents.pose.joints(self.skeleton)
-
-    def _depth(self, index: int) -> Depth:
-        return self.depths(index, index + 1)[0]
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth images of a range of frames, rendered on all threads.
@@ -189,35 +256,17 @@ class SyntheticSession(TrueRecording):
         Returns:
             (stop - start, H, W) float32 mm, 0 if unread.
         """
-        contents = self.contents
-        part = slice(start, stop)
-        camera = self.scene.camera
-        pose = Pose(
-            SE3(contents.pose.root.rotation[part], contents.pose.root.translation[part]),
-            contents.pose.angles[part],
-            contents.pose.scale[part],
-        )
-        bends = None if contents.bends is None else contents.bends[part]
-        vertices = self.surface.vertices(pose, contents.shape, contents.girth[part], bends)
-        out = np.empty((len(vertices), camera.height, camera.width), np.uint16)
-        T_camera_arena = self.T_arena_camera.inverse()
-        render_kernels.frames_parallel(
+        some = self.contents[start:stop]
+        animal = self.surface.vertices(some.pose, some.shape, some.girth, some.bends)
+        return render_frames(
             self.scene.still,
-            render_kernels.Meshes(
-                vertices,
-                self.surface.faces,
-                contents.things[part],
-                contents.thing_faces,
-                contents.shown[part],
-            ),
-            np.ascontiguousarray(T_camera_arena.rotation),
-            T_camera_arena.translation,
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-            render_kernels.SensorNoise(contents.parameters[part], contents.seeds[part], NORMAL),
-            out,
+            render_kernels.part_of(animal, self.surface.faces, ANIMAL),
+            render_kernels.part_of(some.objects, some.object_faces, OBJECT, some.shown),
+            self.scene.camera,
+            self.scene.T_arena_camera,
+            some.parameters,
+            some.seeds,
         )
-        unit = float(contents.parameters[0, UNIT])
-        return out.astype(np.float32) if unit == 1.0 else out * np.float32(unit)
 
     @staticmethod
     def draw(
@@ -228,7 +277,7 @@ class SyntheticSession(TrueRecording):
         family: str = "train",
         noise: float = 1.0,
         erosion_px: int = 0,
-        thing_share: float = 0.0,
+        object_share: float = 0.0,
         spine_mm: float | None = None,
         species: Species | None = None,
         name: str | None = None,
@@ -244,7 +293,7 @@ class SyntheticSession(TrueRecording):
             family: of body shapes, see `draw_shapes`.
             noise: multiplies the sensor's random errors and its rate of holes, see `Sensor.draw`.
             erosion_px: pixels stripped off the animal's outline, see `Sensor.draw`.
-            thing_share: share of frames with a distractor.
+            object_share: share of frames with a distractor.
             spine_mm: length of the animal, mm; None draws it.
             species: the species; None is a mouse.
             name: of the recording; None names it after the sensor.
@@ -255,9 +304,8 @@ class SyntheticSession(TrueRecording):
         rng = np.random.default_rng(seed)
         species = MouseSpecies() if species is None else species
         home = species.skeleton.length
-        sensor = (
-            species.sensors[int(rng.integers(len(species.sensors)))] if sensor is None else sensor
-        )
+        if sensor is None:
+            sensor = species.sensors[int(rng.integers(len(species.sensors)))]
         drawn = home * float(rng.uniform(*species.sizes))
         spine = drawn if spine_mm is None else float(spine_mm)
         scene = SimulatedScene.draw(rng, sensor.camera, spine, species.setting)
@@ -276,13 +324,11 @@ class SyntheticSession(TrueRecording):
             girth,
             noise,
             erosion_px,
-            thing_share,
-            True,
+            object_share,
+            scatter=True,
         )
-        times = np.arange(n_frames, dtype=np.int64) * species.frame_ns
-        return SyntheticSession(
-            name or f"synthetic-{sensor.name.replace(' ', '-').lower()}", scene, contents, times
-        )
+        name = name or f"synthetic-{sensor.name.replace(' ', '-').lower()}"
+        return SyntheticSession(name, scene, contents, np.arange(n_frames) * species.frame_ns)
 
 
 def assemble(
@@ -296,8 +342,8 @@ def assemble(
     girth: Array,
     noise: float,
     erosion_px: int,
-    thing_share: float,
-    scatter: bool,
+    object_share: float,
+    scatter: bool = False,
 ) -> FrameContents:
     """Place postures of one animal in a scene, with a distractor and the sensor's noise.
 
@@ -312,7 +358,7 @@ def assemble(
         girth: (n,) factor of all lengths across the body.
         noise: multiplies the sensor's random errors and its rate of holes.
         erosion_px: pixels stripped off the animal's outline.
-        thing_share: share of frames with a distractor.
+        object_share: share of frames with a distractor.
         scatter: move each posture to its own free position on the floor.
 
     Returns:
@@ -328,11 +374,11 @@ def assemble(
         shift = scene.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1), bottoms)
         pose.root.translation[:, :2] += shift
         trunk[..., :2] += shift[:, None]
-    things, shown = _beside(rng, scene, trunk, spine_mm, thing_share, species, sensor.stride)
+    objects, shown = _beside(rng, scene, trunk, spine_mm, object_share, species, sensor.stride)
     parameters = np.repeat(sensor.draw(rng, 1, shape.fur, noise, erosion_px), n, axis=0)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     return FrameContents(
-        species.skeleton, spine_mm, pose, girth, shape[0], bends, things, shown, parameters, seeds
+        species.skeleton, spine_mm, pose, girth, shape[0], bends, objects, shown, parameters, seeds
     )
 
 
@@ -350,9 +396,9 @@ def _beside(
     Returns:
         Its meshes (n, V, 3) mm and whether it is shown (n,).
     """
-    mesh = draw_thing(rng, str(rng.choice(species.things)), spine_mm)
+    mesh = draw_object(rng, str(rng.choice(species.objects)), spine_mm)
     n = len(trunk)
-    things = np.repeat(mesh[None], n, axis=0)
+    objects = np.repeat(mesh[None], n, axis=0)
     shown = rng.random(n) < share
     reach = 1.1 * scene.half
     for i in np.flatnonzero(shown):
@@ -364,18 +410,18 @@ def _beside(
             # a hand reaches over the wall; other objects are inside
             within = mesh[:, 2].max() > 0.6 * spine_mm or scene.wall_clearance(shift) > 0
             free = bool(gap > 8.0 * species.setting.scale and within)
-            if free and not _covers(scene, things[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
-                things[i, :, :2] += shift
+            if free and not _covers(scene, objects[i] + [*shift, 0.0], trunk[i], 4.0 * stride):
+                objects[i, :, :2] += shift
                 break
         else:
             shown[i] = False
-    return things, shown
+    return objects, shown
 
 
-def _covers(scene: SimulatedScene, thing: Array, trunk: Array, margin_px: float) -> bool:
+def _covers(scene: SimulatedScene, item: Array, trunk: Array, margin_px: float) -> bool:
     """Whether the distractor and the animal overlap in the image, or nearly so."""
     T_camera_arena = scene.T_arena_camera.inverse()
-    a = scene.camera.project(T_camera_arena @ thing)
+    a = scene.camera.project(T_camera_arena @ item)
     b = scene.camera.project(T_camera_arena @ trunk)
     gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
     middle = b.mean(axis=0)
@@ -383,53 +429,31 @@ def _covers(scene: SimulatedScene, thing: Array, trunk: Array, margin_px: float)
     return bool(gap < margin_px or around)
 
 
-def test_split(
+def planned(
     name: str,
-    spine_mm: float | None = None,  # noqa: PT028
-    n_sessions: int = N_SESSIONS,  # noqa: PT028
-    species: Species | None = None,  # noqa: PT028
-    seed: int | None = None,  # noqa: PT028
-) -> list[SyntheticSession]:
-    """The sessions of a fixed split: 40 of 50 frames, equally from each sensor.
-
-    Args:
-        name: 'clean', 'hard', 'other-body' or 'other-camera', a key of `SPLITS`; or 'sealed', see
-            `SEALED`.
-        spine_mm: length of every animal, mm; None draws it.
-        n_sessions: number of sessions, from the first on.
-        species: the species; None is a mouse.
-        seed: another seed makes similar recordings for development; None is the split's own.
-
-    Returns:
-        The sessions, session k named after the split and k.
+    n_sessions: int,
+    splits: Mapping[str, tuple[int, str, float, int, float]],
+    sealed_seed: int,
+) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """Turn among the cameras, kind and settings of each recording of a split.
 
     Raises:
         LiexError: there is no split of this name.
     """
-    if name not in (*SPLITS, SEALED):
-        raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
-    species = MouseSpecies() if species is None else species
-    sessions = []
+    if name not in (*splits, SEALED):
+        raise LiexError(f"there is no split '{name}'; known are {', '.join(splits)}")
     for k in range(n_sessions):
         kind = split_of(name, k)
-        frozen, family, noise, erosion_px, thing_share = SPLITS[kind]
-        own = frozen if name != SEALED else _SEALED_SEED
-        sensors = unseen(species.sensors) if kind == OTHER_CAMERA else species.sensors
-        sensor = sensors[k % len(sensors) if name != SEALED else k // len(SPLITS) % len(sensors)]
-        sessions.append(
-            SyntheticSession.draw(
-                [own if seed is None else seed, k],
-                sensor=sensor,
-                family=family,
-                noise=noise,
-                erosion_px=erosion_px * sensor.stride,
-                thing_share=thing_share,
-                spine_mm=spine_mm,
-                species=species,
-                name=f"{name}-{k:02d}",
-            )
-        )
-    return sessions
+        seed, family, noise, erosion_px, object_share = splits[kind]
+        settings = {
+            "seed": [seed if name != SEALED else sealed_seed, k],
+            "family": family,
+            "noise": noise,
+            "erosion_px": erosion_px,
+            "object_share": object_share,
+            "name": f"{name}-{k:02d}",
+        }
+        yield k if name != SEALED else k // len(splits), kind, settings
 
 
 def split_of(name: str, k: int) -> str:
@@ -440,6 +464,3 @@ def split_of(name: str, k: int) -> str:
         k: number of the recording.
     """
     return tuple(SPLITS)[k % len(SPLITS)] if name == SEALED else name
-
-
-test_split.__test__ = False  # type: ignore[attr-defined]  # its name is not a test's

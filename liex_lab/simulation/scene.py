@@ -11,10 +11,10 @@ Arena frame: z up from the floor, the origin at the foot of the camera's perpend
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.body._skinning_kernels import joined_faces
 from liex_lab.body.surface import render_mesh
@@ -23,10 +23,11 @@ from liex_lab.optics.camera import Camera
 
 Array = NDArray[np.float64]
 
-THINGS = ("block", "ball", "cable", "hand")
+OBJECTS = ("block", "ball", "cable", "hand")
 N_PARTS = 8
 _RINGS = 7
 _SEGMENTS = 14
+SPHERE_TUBE = (_RINGS, _SEGMENTS)
 
 
 def _unit_sphere() -> Array:
@@ -41,8 +42,23 @@ def _unit_sphere() -> Array:
 
 
 SPHERE = _unit_sphere()
-THING_FACES = joined_faces([(_RINGS, _SEGMENTS)] * N_PARTS)
-PART_FACES = joined_faces([(_RINGS, _SEGMENTS)])
+OBJECT_FACES = joined_faces([SPHERE_TUBE] * N_PARTS)
+PART_FACES = joined_faces([SPHERE_TUBE])
+
+
+def turned(xy: Array, yaw: float) -> Array:
+    """Points rotated about the vertical.
+
+    Args:
+        xy: (..., 2) mm.
+        yaw: rad.
+
+    Returns:
+        (..., 2) mm.
+    """
+    c = np.cos(yaw)
+    s = np.sin(yaw)
+    return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
 
 
 def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
@@ -60,58 +76,103 @@ def rounded(centre: Array, radii: Array, yaw: Array, power: Array) -> Array:
     p = np.asarray(power, float)[..., None, None]
     unit = SPHERE / (np.abs(SPHERE) ** p).sum(axis=-1, keepdims=True) ** (1.0 / p)
     local = unit * np.asarray(radii, float)[..., None, :]
-    c = np.cos(yaw)[..., None]
-    s = np.sin(yaw)[..., None]
-    turned = np.stack(
-        [
-            c * local[..., 0] - s * local[..., 1],
-            s * local[..., 0] + c * local[..., 1],
-            local[..., 2],
-        ],
-        -1,
-    )
-    return turned + np.asarray(centre, float)[..., None, :]
+    xy = turned(local[..., :2], np.asarray(yaw)[..., None])
+    return np.concatenate([xy, local[..., 2:]], axis=-1) + np.asarray(centre, float)[..., None, :]
 
 
-def _pellet(
-    rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
-) -> None:
+# parts of an object: centre and radii, mm; yaw, rad; power of the superellipsoid
+Parts = list[tuple[ArrayLike, ArrayLike, float, float]]
+
+
+def mesh_of(parts: Parts) -> Array:
+    """Vertices (N_PARTS * V, 3) of an object of at most N_PARTS superellipsoids; unused ones have
+    zero size.
+    """
+    unused = (np.zeros(3), np.zeros(3), 0.0, 2.0)
+    columns = zip(*(parts + [unused] * (N_PARTS - len(parts))), strict=True)
+    return rounded(*(np.array(column) for column in columns)).reshape(-1, 3)
+
+
+def _block(rng: np.random.Generator, spine_mm: float) -> Parts:
+    radii = spine_mm * rng.uniform(0.16, 0.55, 3) * [1.0, 0.75, 0.6]
+    return [([0.0, 0.0, radii[2]], radii, rng.uniform(-np.pi, np.pi), 12.0)]
+
+
+def _ball(rng: np.random.Generator, spine_mm: float) -> Parts:
+    radii = spine_mm * rng.uniform(0.16, 0.55, 3) * [1.0, 0.75, 0.6]
+    radii = radii.mean() * rng.uniform(0.9, 1.1, 3)
+    return [([0.0, 0.0, radii[2]], radii, 0.0, 2.0)]
+
+
+def _pellet(rng: np.random.Generator, spine_mm: float) -> Parts:
     """A sinking lump of food."""
-    radii[0] = spine_mm * rng.uniform(0.04, 0.13) * rng.uniform(0.7, 1.0, 3)
-    centre[0, 2] = radii[0, 2] + spine_mm * rng.uniform(0.0, 2.0)
+    radii = spine_mm * rng.uniform(0.04, 0.13) * rng.uniform(0.7, 1.0, 3)
+    return [([0.0, 0.0, radii[2] + spine_mm * rng.uniform(0.0, 2.0)], radii, 0.0, 2.0)]
 
 
-def _plant(
-    rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
-) -> None:
+def _plant(rng: np.random.Generator, spine_mm: float) -> Parts:
     """A tuft of thin leaves in the water."""
-    for k in range(N_PARTS):
+    parts: Parts = []
+    for _ in range(N_PARTS):
         tall = spine_mm * rng.uniform(0.3, 0.9)
-        radii[k] = [spine_mm * rng.uniform(0.02, 0.05), spine_mm * rng.uniform(0.03, 0.10), tall]
-        centre[k] = [*rng.normal(0.0, 0.12, 2) * spine_mm, 0.9 * tall]
-        yaw[k] = rng.uniform(-np.pi, np.pi)
+        radii = [spine_mm * rng.uniform(0.02, 0.05), spine_mm * rng.uniform(0.03, 0.10), tall]
+        centre = [*rng.normal(0.0, 0.12, 2) * spine_mm, 0.9 * tall]
+        parts.append((centre, radii, rng.uniform(-np.pi, np.pi), 2.0))
+    return parts
 
 
-def _fish(
-    rng: np.random.Generator, spine_mm: float, centre: Array, radii: Array, yaw: Array
-) -> None:
+def _fish(rng: np.random.Generator, spine_mm: float) -> Parts:
     """Another fish, much smaller than the animal: a body and a tail."""
     long = spine_mm * rng.uniform(0.30, 0.55)
     heading = rng.uniform(-np.pi, np.pi)
     ahead = np.array([np.cos(heading), np.sin(heading)])
     lift = spine_mm * rng.uniform(0.15, 1.5)
-    for k, (at, length, wide, high) in enumerate(
-        [(0.12, 0.40, 0.075, 0.11), (-0.32, 0.22, 0.02, 0.07)]
-    ):
-        centre[k] = [*(at * long * ahead), lift]
-        radii[k] = long * np.array([length, wide, high])
-        yaw[k] = heading
+    return [
+        ([*(at * long * ahead), lift], long * np.array(sides), heading, 2.0)
+        for at, sides in ((0.12, [0.40, 0.075, 0.11]), (-0.32, [0.22, 0.02, 0.07]))
+    ]
 
 
-_IN_WATER = {"pellet": _pellet, "plant": _plant, "fish": _fish}
+def _cable(rng: np.random.Generator, spine_mm: float) -> Parts:
+    step = rng.uniform(10, 22)
+    thick = rng.uniform(3, 7)
+    heading = rng.uniform(-3, 3)
+    bend = rng.normal(0, 0.25)
+    at = np.array([-3.5 * step * np.cos(heading), -3.5 * step * np.sin(heading)])
+    parts: Parts = []
+    for _ in range(N_PARTS):
+        parts.append(([*at, thick], [0.8 * step, thick, thick], heading, 2.0))
+        at = at + step * np.array([np.cos(heading), np.sin(heading)])
+        heading += bend + rng.normal(0, 0.15)
+    return parts
 
 
-def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
+def _hand(rng: np.random.Generator, spine_mm: float) -> Parts:
+    lift = rng.uniform(0, 50)
+    size = rng.uniform(0.8, 1.1)
+    pointing = rng.uniform(-np.pi, np.pi)
+    palm = ([0.0, 0.0, lift + 16], size * np.array([42.0, 38.0, 15.0]), pointing, 3.0)
+    parts: Parts = [palm]
+    for k in range(1, 6):
+        fan = pointing + (k - 3) * 0.28
+        reach = size * (70.0 if k < 5 else 55.0)
+        centre = [reach * np.cos(fan), reach * np.sin(fan), lift + 12]
+        parts.append((centre, size * np.array([34.0, 8.0, 8.0]), fan, 2.0))
+    return parts
+
+
+_OBJECTS_BY_KIND = {
+    "block": _block,
+    "ball": _ball,
+    "pellet": _pellet,
+    "plant": _plant,
+    "fish": _fish,
+    "cable": _cable,
+    "hand": _hand,
+}
+
+
+def draw_object(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
     """Vertices of one random object on the floor around the origin.
 
     Blocks and balls are from a third of to slightly over the animal's size; in a tank there are
@@ -119,53 +180,13 @@ def draw_thing(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
 
     Args:
         rng: random number generator.
-        kind: 'block', 'ball', 'cable', 'pellet', 'plant' or 'fish'; anything else is a hand.
+        kind: 'block', 'ball', 'cable', 'hand', 'pellet', 'plant' or 'fish'.
         spine_mm: length of the animal, mm, which sets the size; cables and hands have their own.
 
     Returns:
-        (N_PARTS * V, 3) mm, arena frame, with triangles as in `THING_FACES`.
+        (N_PARTS * V, 3) mm, arena frame, with triangles as in `OBJECT_FACES`.
     """
-    centre = np.zeros((N_PARTS, 3))
-    radii = np.zeros((N_PARTS, 3))
-    yaw = np.zeros(N_PARTS)
-    power = np.full(N_PARTS, 2.0)
-    if kind in ("block", "ball"):
-        radii[0] = spine_mm * rng.uniform(0.16, 0.55, 3) * [1.0, 0.75, 0.6]
-        if kind == "block":
-            yaw[0] = rng.uniform(-np.pi, np.pi)
-            power[0] = 12.0
-        else:
-            radii[0] = radii[0].mean() * rng.uniform(0.9, 1.1, 3)
-        centre[0, 2] = radii[0, 2]
-    elif kind in _IN_WATER:
-        _IN_WATER[kind](rng, spine_mm, centre, radii, yaw)
-    elif kind == "cable":
-        step = rng.uniform(10, 22)
-        thick = rng.uniform(3, 7)
-        heading = rng.uniform(-3, 3)
-        bend = rng.normal(0, 0.25)
-        at = np.array([-3.5 * step * np.cos(heading), -3.5 * step * np.sin(heading)])
-        for k in range(N_PARTS):
-            centre[k] = [*at, thick]
-            radii[k] = [0.8 * step, thick, thick]
-            yaw[k] = heading
-            at = at + step * np.array([np.cos(heading), np.sin(heading)])
-            heading += bend + rng.normal(0, 0.15)
-    else:
-        lift = rng.uniform(0, 50)
-        size = rng.uniform(0.8, 1.1)
-        pointing = rng.uniform(-np.pi, np.pi)
-        centre[0] = [0, 0, lift + 16]
-        radii[0] = size * np.array([42.0, 38.0, 15.0])
-        power[0] = 3.0
-        yaw[0] = pointing
-        for k in range(1, 6):
-            fan = pointing + (k - 3) * 0.28
-            reach = size * (70.0 if k < 5 else 55.0)
-            centre[k] = [reach * np.cos(fan), reach * np.sin(fan), lift + 12]
-            radii[k] = size * np.array([34.0, 8.0, 8.0])
-            yaw[k] = fan
-    return rounded(centre, radii, yaw, power).reshape(-1, 3)
+    return mesh_of(_OBJECTS_BY_KIND[kind](rng, spine_mm))
 
 
 ROUND = "round"
@@ -185,7 +206,7 @@ class SceneSpec:
         tilt_rad: largest tilt of a camera, rad.
         walls_mm: lowest and highest walls.
         open_share: share of scenes without walls.
-        clutter: kinds of objects in the scene, see `draw_thing`.
+        clutter: kinds of objects in the scene, see `draw_object`.
         scale: of corners, unevenness, distances and estimation errors, over those of a mouse's
             arena.
     """
@@ -245,8 +266,7 @@ class SimulatedScene:
         Returns:
             The scene with its ideal depth image.
         """
-        T = draw_views(rng, 1, setting)
-        T_arena_camera = SE3(T.rotation[0], T.translation[0])
+        T_arena_camera = draw_views(rng, 1, setting)[0]
         height = float(T_arena_camera.translation[2])
         view = height * np.array([camera.width / camera.fx, camera.height / camera.fy]) / 2.0
         kind = str(rng.choice([ROUND, BOX]))
@@ -263,16 +283,10 @@ class SimulatedScene:
         wall_mm = float(rng.uniform(low, min(high, 0.7 * height)))
         if rng.random() < setting.open_share:
             wall_mm = 0.0  # an open table
+        no_clutter = np.zeros((0, 2))
+        unseen = np.zeros((0, 0), np.float32)
         scene = SimulatedScene(
-            camera,
-            T_arena_camera,
-            kind,
-            centre,
-            half,
-            yaw,
-            wall_mm,
-            np.zeros((0, 2)),
-            np.zeros((0, 0), np.float32),
+            camera, T_arena_camera, kind, centre, half, yaw, wall_mm, no_clutter, unseen
         )
         return scene._furnished(rng, spine_mm, setting)
 
@@ -284,32 +298,15 @@ class SimulatedScene:
         T_camera_arena = self.T_arena_camera.inverse()
         outline = []
         for _ in range(rng.choice([0, 1, 2], p=[0.65, 0.25, 0.10])):
-            mesh = draw_thing(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
+            mesh = draw_object(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
             azimuth = rng.uniform(-np.pi, np.pi)
             local = 0.8 * self.half * [np.cos(azimuth), np.sin(azimuth)]
-            mesh[:, :2] += self.centre + self._turned(local, self.yaw)
-            thing = render_mesh(mesh, THING_FACES, self.camera, T_camera_mesh=T_camera_arena)
-            still = np.where((thing > 0) & ((still == 0) | (thing < still)), thing, still)
+            mesh[:, :2] += self.centre + turned(local, self.yaw)
+            item = render_mesh(mesh, OBJECT_FACES, self.camera, T_camera_mesh=T_camera_arena)
+            still = np.where((item > 0) & ((still == 0) | (item < still)), item, still)
             outline.append(mesh[:, :2])
         clutter = np.concatenate(outline) if outline else np.zeros((0, 2))
-        return SimulatedScene(
-            self.camera,
-            self.T_arena_camera,
-            self.kind,
-            self.centre,
-            self.half,
-            self.yaw,
-            self.wall_mm,
-            clutter,
-            still,
-        )
-
-    @staticmethod
-    def _turned(xy: Array, yaw: float) -> Array:
-        """Points (..., 2) rotated by yaw rad."""
-        c = np.cos(yaw)
-        s = np.sin(yaw)
-        return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
+        return replace(self, clutter=clutter, still=still)
 
     def wall_clearance(self, xy: Array) -> Array:
         """Signed distance of floor points from the walls, mm; negative outside.
@@ -320,7 +317,7 @@ class SimulatedScene:
         Returns:
             (...) mm.
         """
-        local = self._turned(xy - self.centre, -self.yaw)
+        local = turned(xy - self.centre, -self.yaw)
         if self.kind == ROUND:
             return self.half[0] - np.hypot(local[..., 0], local[..., 1])
         return np.min(self.half - np.abs(local), axis=-1)
@@ -358,7 +355,7 @@ class SimulatedScene:
         fall = np.where(d[..., 2] < -1e-3, -d[..., 2], 1e-3)
         floor = height / fall
         ground = floor[..., None] * d[..., :2]
-        raised = _unevenness(rng, ground, scale)
+        raised = unevenness(rng, ground, scale)
         wall_clearance = self.wall_clearance(ground)
         # multi-path reflections fill the corner between floor and wall
         corner = rng.uniform(0.0, 12.0) * scale
@@ -374,15 +371,15 @@ class SimulatedScene:
             depth = np.where(beyond, floor - raised / fall, depth)
         elif rng.random() < 0.4:  # the cluttered room around the arena
             around = (
-                height + rng.uniform(0.0, 700.0) * scale - 60.0 * _unevenness(rng, ground, scale)
+                height + rng.uniform(0.0, 700.0) * scale - 60.0 * unevenness(rng, ground, scale)
             )
             depth = np.where(beyond & (d[..., 2] < -0.2), around / fall, depth)
         return np.where((depth > 100.0) & (depth < 4500.0), depth, 0.0).astype(np.float32)
 
     def _wall_distance(self, direction: Array) -> Array:
         """Depth (H, W) mm at which rays leave the walls' outline; 0 if they never do."""
-        start = self._turned(-self.centre, -self.yaw)
-        d = self._turned(direction[..., :2], -self.yaw)
+        start = turned(-self.centre, -self.yaw)
+        d = turned(direction[..., :2], -self.yaw)
         if self.kind == ROUND:
             a = np.sum(d * d, axis=-1)
             b = d @ start
@@ -500,7 +497,9 @@ def outline_of(vertices: Array, n_directions: int = 24) -> Array:
     return np.take_along_axis(vertices[..., :2], extent.argmax(axis=1)[..., None], axis=1)
 
 
-def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
+def unevenness(
+    rng: np.random.Generator, ground: Array, scale: float = 1.0, most: float = 0.7
+) -> Array:
     """Heights (H, W) mm of an uneven floor: a few long waves over points (H, W, 2) mm."""
     waves = np.zeros(ground.shape[:-1])
     for _ in range(4):
@@ -508,7 +507,7 @@ def _unevenness(rng: np.random.Generator, ground: Array, scale: float) -> Array:
         length = rng.uniform(70.0, 350.0) * scale
         along = ground @ np.array([np.cos(azimuth), np.sin(azimuth)])
         waves += (
-            rng.uniform(0.0, 0.7)
+            rng.uniform(0.0, most)
             * scale
             * np.sin(2 * np.pi * along / length + rng.uniform(0, 2 * np.pi))
         )

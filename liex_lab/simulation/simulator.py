@@ -1,120 +1,65 @@
 """Synthetic data generators, one per animal: training patches, test splits, recordings with truth.
 
 Each simulator renders a posed body mesh through a depth camera with a sensor noise model and
-returns the exact pose with every depth image. Mouse and fish have their own pose and locomotion
-models (`MouseSimulator`, `FishSimulator`), the hand its own scene (`HandSimulator`); any animal
-with a skeleton and a surface is drawn within its joint limits (`GenericSimulator`). Everything is
-drawn from seeds, so that any part of a set can be reproduced, in any order.
+returns the exact pose with every depth image. Animals have a pose and a locomotion model
+(`BodySimulator` of a `Species`), the hand its own scene (`HandSimulator`). Everything is drawn from
+seeds, so that any part of a set can be reproduced, in any order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+import difflib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Final
+from urllib.parse import parse_qsl
+
+import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.simulation import generic, locomotion, recording, training_patches
-from liex_lab.simulation.fish import FishSpecies
-from liex_lab.simulation.generic import GenericSpecies
+from liex_lab.errors import RecordingError
+from liex_lab.optics.camera import Lens
+from liex_lab.recordings.camera_file import fitting
+from liex_lab.recordings.recording import Recording
+from liex_lab.simulation import corruptions, training_patches
+from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.hand.pose_prior import find_reference
-from liex_lab.simulation.hand.simulator import HandSimulator
-from liex_lab.simulation.recording import SyntheticSession, TrueRecording
-from liex_lab.simulation.species import MouseSpecies, Species
+from liex_lab.simulation.hand.simulator import (
+    FRAME_NS,
+    NYU_SENSOR,
+    HandFrameContents,
+    HandSession,
+    HandSimulator,
+)
+from liex_lab.simulation.locomotion import moving_session
+from liex_lab.simulation.recording import (
+    OTHER_CAMERA,
+    SEALED_SEED,
+    SPLITS,
+    FrameContents,
+    SyntheticSession,
+    TrueRecording,
+    planned,
+)
+from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
+from liex_lab.simulation.species import (
+    BY_NAME,
+    FishSpecies,
+    GenericSpecies,
+    MouseSpecies,
+    Sensor,
+    Species,
+    unseen,
+)
 from liex_lab.simulation.training_patches import TrainingPatches
 
-
-class Simulator(Protocol):
-    """Interface of an animal's source of synthetic training and test data.
-
-    Everything is drawn from seeds, in any order. `world_of` selects the implementation.
-    """
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The animal's skeleton."""
-
-    @property
-    def splits(self) -> tuple[str, ...]:
-        """The names of the test splits."""
-
-    @property
-    def protocol(self) -> str:
-        """One sentence on the test splits, for reports of results."""
-
-    @property
-    def test_postures(self) -> str:
-        """Source of the postures of the test splits, one phrase; '' if they follow from seeds
-        alone.
-        """
-
-    @property
-    def sources(self) -> str:
-        """Source of the training images, one phrase, for a model's card."""
-
-    def training_blocks(
-        self,
-        seed: int,
-        n_blocks: int,
-        *,
-        first: int = 0,
-        family: str = "train",
-        noise: float = 1.0,
-        erosion_px: int = 0,
-        degraded_share: float = 0.0,
-        spine_mm: float | None = None,
-        window_px: int = 144,
-        parallel: bool = True,
-    ) -> Iterator[TrainingPatches]:
-        """Blocks of `BLOCK` training patches with truth; see `training_patches.training_blocks`.
-
-        Args:
-            seed: of the whole set; a block depends only on the seed and its number.
-            n_blocks: number of blocks.
-            first: number of the first block.
-            family: of body shapes, one of `body.shape.FAMILIES`.
-            noise: multiplies the sensor's random errors and its rate of holes.
-            erosion_px: pixels stripped off the animal's outline.
-            degraded_share: share of mini-sessions with more noise; half of them also have more
-                erosion.
-            spine_mm: mean length of the animals, mm; None uses the skeleton's own.
-            window_px: side of the patches, px.
-            parallel: render on all threads; the images are the same either way.
-
-        Returns:
-            An iterator of sets of patches, one per block.
-        """
-
-    def test_split(
-        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
-    ) -> Sequence[TrueRecording]:
-        """The recordings of one of the `splits`.
-
-        Args:
-            name: of the split.
-            spine_mm: length of every animal, mm; None draws it.
-            n_sessions: number of recordings, from the first on.
-
-        Returns:
-            One recording with truth per session, each with its own camera, surroundings and animal.
-        """
-
-    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> TrueRecording:
-        """A continuous recording of one moving animal.
-
-        Args:
-            seed: seed or seeds of all random numbers.
-            n_frames: length of the recording.
-            **settings: keyword arguments as in `locomotion.walking_session`.
-
-        Returns:
-            The recording with its truth.
-        """
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class BodySimulator:
-    """Simulator of an animal that is described by a `Species`.
+    """Source of synthetic training and test data of an animal described by a `Species`.
 
     Attributes:
         species: the animal's species.
@@ -122,7 +67,7 @@ class BodySimulator:
     """
 
     species: Species
-    splits: tuple[str, ...] = tuple(recording.SPLITS)
+    splits: tuple[str, ...] = tuple(SPLITS)
 
     @property
     def skeleton(self) -> Skeleton:
@@ -165,7 +110,7 @@ class BodySimulator:
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40
     ) -> list[SyntheticSession]:
-        """The recordings of a split; see `recording.test_split`.
+        """The recordings of a split: 40 of 50 frames, equally from each sensor.
 
         Args:
             name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
@@ -179,76 +124,31 @@ class BodySimulator:
         Raises:
             LiexError: there is no split of this name.
         """
-        return recording.test_split(name, spine_mm, n_sessions, self.species)
-
-
-@dataclass(frozen=True)
-class MouseSimulator(BodySimulator):
-    """Simulator of a mouse in an arena, recorded from above."""
-
-    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """A recording of a mouse that walks, turns, rears and curls up; see `walking_session`.
-
-        Args:
-            seed: seed or seeds of all random numbers.
-            n_frames: length of the recording, at 30 frames/s.
-            **settings: further keyword arguments of `locomotion.walking_session`.
-
-        Returns:
-            The recording with its truth.
-        """
-        assert isinstance(self.species, MouseSpecies)
-        return locomotion.walking_session(seed, n_frames, species=self.species, **settings)
-
-
-@dataclass(frozen=True)
-class FishSimulator(BodySimulator):
-    """Simulator of a zebrafish in a tank, recorded from above."""
+        sessions = []
+        for turn, kind, settings in planned(name, n_sessions, SPLITS, SEALED_SEED):
+            sensors = self.species.sensors
+            if kind == OTHER_CAMERA:
+                sensors = unseen(sensors)
+            settings |= {"sensor": sensors[turn % len(sensors)], "spine_mm": spine_mm}
+            settings["erosion_px"] *= settings["sensor"].stride
+            sessions.append(SyntheticSession.draw(species=self.species, **settings))
+        return sessions
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """A recording of a fish that swims in bouts; see `swimming_session`.
-
-        Args:
-            seed: seed or seeds of all random numbers.
-            n_frames: length of the recording, at 50 frames/s.
-            **settings: further keyword arguments of `locomotion.swimming_session`.
-
-        Returns:
-            The recording with its truth.
-        """
-        assert isinstance(self.species, FishSpecies)
-        return locomotion.swimming_session(seed, n_frames, species=self.species, **settings)
-
-
-@dataclass(frozen=True)
-class GenericSimulator(BodySimulator):
-    """Simulator of any animal on a floor, or above one."""
-
-    def window_px(self, length_mm: float) -> int:
-        """Side of a square patch, px, that contains an animal of this mean length at any position.
-
-        Args:
-            length_mm: mean length of the animals, mm.
-
-        Returns:
-            The side, a multiple of 8 px.
-        """
-        assert isinstance(self.species, GenericSpecies)
-        return self.species.window_px(length_mm)
-
-    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """A recording of an animal that moves and changes its posture; see `moving_session`.
+        """A continuous recording of one moving animal.
 
         Args:
             seed: seed or seeds of all random numbers.
             n_frames: length of the recording.
-            **settings: further keyword arguments of `generic.moving_session`.
+            **settings: further keyword arguments of `locomotion.moving_session`.
 
         Returns:
             The recording with its truth.
         """
-        assert isinstance(self.species, GenericSpecies)
-        return generic.moving_session(seed, n_frames, species=self.species, **settings)
+        return moving_session(self.species, seed, n_frames, **settings)
+
+
+Simulator = BodySimulator | HandSimulator
 
 
 def world_of(skeleton: Skeleton) -> Simulator:
@@ -261,9 +161,322 @@ def world_of(skeleton: Skeleton) -> Simulator:
         The simulator; that of the hand uses labelled test postures if `find_reference` finds any.
     """
     if skeleton.name == "mouse":
-        return MouseSimulator(MouseSpecies(skeleton))
+        return BodySimulator(MouseSpecies(skeleton))
     if skeleton.name == "fish":
-        return FishSimulator(FishSpecies(skeleton))
+        return BodySimulator(FishSpecies(skeleton))
     if skeleton.name == "hand":
         return HandSimulator(skeleton, find_reference())
-    return GenericSimulator(GenericSpecies(skeleton))
+    return BodySimulator(GenericSpecies.of(skeleton))
+
+
+# Benchmark sequences for tracking: one moving animal, clean or corrupted, with exact truth.
+
+
+# frames, as in the paper; own seed; noise; eroded pixels; whether there are corruptions
+SEQUENCES = {
+    "easy": (511, 75_001, 1.0, 0, False),
+    "hard": (300, 76_001, 2.0, 1, True),
+}
+
+
+class TestSequence(TrueRecording):
+    """A recording with its truth and events.
+
+    Attributes:
+        scene: the recording without the losses.
+        events: in order of their start.
+    """
+
+    __test__ = False
+
+    def __init__(
+        self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str
+    ) -> None:
+        """Apply losses to a recording and keep its truth.
+
+        Args:
+            scene: the recording without the losses.
+            events: its events, in order of start.
+            loss: readings that are lost in its frames.
+            name: of the sequence.
+        """
+        super().__init__(name, scene.camera, scene.times_ns.copy(), **scene.truth)
+        self.scene = scene
+        self.events = events
+        self._loss = loss
+
+    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
+        """Depth images of a range of frames, with the losses.
+
+        Args:
+            start: first frame.
+            stop: one past the last frame.
+
+        Returns:
+            (stop - start, H, W) float32 mm, 0 if unread.
+        """
+        scene = self.scene
+        depths = scene.depths(start, stop)
+        middle = self.joints_camera.mean(axis=1)
+        reach = 1.2 * self.spine_mm * scene.camera.fx / middle[:, 2]
+        still = scene.scene.still if isinstance(scene, SyntheticSession) else None
+        middle_px = scene.camera.project(middle)
+        self._loss.apply(depths, still, start, scene.contents.seeds, middle_px, reach)
+        return depths
+
+
+def tracking_sequence(
+    world: Simulator,
+    name: str,
+    *,
+    seed: int | None = None,
+    n_frames: int | None = None,
+    sensor: Sensor | None = None,
+    spine_mm: float | None = None,
+) -> TestSequence:
+    """The fixed sequence 'easy' or 'hard' of an animal; other seeds make similar ones.
+
+    hard: bursts of holes, dropped frames, a bar passing between camera and animal, a second object,
+    an animal that is lost in the floor's noise or in glare, and stretches at two to three times the
+    speed.
+
+    Args:
+        world: the animal's simulator.
+        name: 'easy' or 'hard', a key of `SEQUENCES`.
+        seed: another seed makes a development sequence; None is the fixed one.
+        n_frames: its length; None is the fixed one.
+        sensor: the camera's make; None is the animal's first.
+        spine_mm: length of the animal, mm; None draws it.
+
+    Returns:
+        The sequence with its truth and its events, including 'hidden' spans.
+
+    Raises:
+        RecordingError: there is no such sequence, or none of this animal.
+    """
+    if name not in SEQUENCES:
+        raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
+    if isinstance(world, HandSimulator):
+        sensor, step_ns, floats = sensor or NYU_SENSOR, FRAME_NS, True
+    else:
+        species = world.species
+        sensor, step_ns, floats = sensor or species.sensors[0], species.frame_ns, species.floats
+    usual_frames, usual_seed, noise, erosion_px, corrupted = SEQUENCES[name]
+    n = n_frames or usual_frames
+    own_seed = [usual_seed if seed is None else seed]
+    rng = np.random.default_rng([*own_seed, 1])
+    events: list[Event] = []
+    steps = np.ones(n, np.int64)
+    pace = np.ones(n, np.int64)
+    if corrupted:
+        events, steps = corruptions.draw_script(rng, n, step_ns * 1e-9)
+        pace = corruptions.pace(rng, events, n)
+    rows = np.cumsum(np.concatenate([[0], (steps * pace)[1:]]))
+    base = world.motion(
+        own_seed,
+        int(rows[-1]) + 1,
+        sensor=sensor,
+        noise=noise,
+        erosion_px=erosion_px * sensor.stride,
+        spine_mm=spine_mm,
+    )
+    times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(step_ns)
+    loss = Loss.draw(rng, events, base.camera, base.joints_camera[rows], base.spine_mm, floats)
+    title = f"track-{name}-{base.skeleton.name}-{own_seed[0]}"
+    contents: Any = base.contents[rows]
+    if events:
+        contents, hidden = _with_objects(rng, world, base, rows, events, floats)
+        events = sorted([*events, *hidden], key=lambda event: (event.start, event.stop))
+    scene = (
+        HandSession(title, base.skeleton, base.sensor, contents, times)
+        if isinstance(base, HandSession)
+        else SyntheticSession(title, base.scene, contents, times)
+    )
+    return TestSequence(scene, events, loss, title)
+
+
+def _with_objects(
+    rng: np.random.Generator,
+    world: Simulator,
+    base: SyntheticSession | HandSession,
+    rows: NDArray[np.int64],
+    events: list[Event],
+    floats: bool,
+) -> tuple[FrameContents | HandFrameContents, list[Event]]:
+    """Some moments of a recording with an occluder and a distractor, and its hidden spans."""
+
+    def beside(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
+        if isinstance(base, HandSession):
+            return corruptions.beside_hand(rng, joints, length_mm)
+        assert isinstance(world, BodySimulator)
+        return corruptions.beside_animal(rng, base.scene, joints, length_mm, world.species.objects)
+
+    T_arena_camera = base.T_arena_camera
+    in_arena = corruptions.draw_objects(
+        rng,
+        events,
+        T_arena_camera.translation,
+        base.joints_arena[rows],
+        base.spine_mm,
+        beside,
+        floats,
+    )
+    objects = T_arena_camera.inverse() @ in_arena
+    contents: Any = base.contents[rows]
+    if isinstance(base, HandSession):
+        body = contents.hand
+    else:
+        mesh = base.surface.vertices(contents.pose, contents.shape, contents.girth, contents.bends)
+        body = T_arena_camera.inverse() @ mesh[:, : base.surface.n_trunk_vertices]
+    spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
+    occluded = np.concatenate(spans) if spans else np.zeros(0, np.int64)
+    occluder = objects[:, : objects.shape[1] // 2]
+    share = corruptions.visible_share(body[:, ::4], occluder, base.camera, occluded)
+    contents = replace(
+        contents,
+        objects=objects if isinstance(base, HandSession) else in_arena,
+        shown=np.ones(len(rows), np.bool_),
+        object_faces=corruptions.TWO_FACES,
+    )
+    return contents, corruptions.hidden_spans(share)
+
+
+# Addresses of synthetic recordings, `synthetic:<kind>?<key>=<value>&...`, opened like a file.
+
+
+_ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
+_SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
+_SCENE: Final = "scene"
+_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, _SCENE)
+_SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
+_EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
+_MOST_FRAMES = 100_000  # an hour; the truth of every frame is in memory
+_MOST_SCENE_FRAMES = 20_000  # cables and bedding are also in memory
+_SIZES = (0.5, 2.9)  # of the home length
+_BUILDS = ("other", "train")  # builds of animals in scenes: not used in training, or used
+
+
+def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
+    """Open the virtual recording at an address.
+
+    An example is synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65. Kinds: walk, a
+    mouse; swim, a fish; gesture, a hand; move, the animal of a skeleton's TOML, animal=snake.toml.
+    Every setting is optional: the defaults are seed 0, 300 frames, the animal's usual sensor, and a
+    size drawn from the seed. track-easy and track-hard are the test sequences
+    of a mouse, or with animal=fish or animal=hand of those; with a
+    seed or more frames they are new sequences of the same kind. scene is one of
+    `simulation.scenes`, such as synthetic:scene?name=raised&seed=3; build=train uses a training
+    body.
+
+    Args:
+        address: the recording's address, starting with synthetic:.
+        camera: overrides the true camera, to test the effect of a wrong one; None uses the true
+            one.
+
+    Returns:
+        A recording with truth (a `TrueRecording`).
+
+    Raises:
+        RecordingError: the kind, a setting or its value is invalid, or the animal is missing.
+    """
+    kind, _, query = address.removeprefix("synthetic:").partition("?")
+    if kind not in _KINDS:
+        raise RecordingError(
+            f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in "
+            f"{_EXAMPLE}"
+        )
+    stated = dict(parse_qsl(query, keep_blank_values=True))
+    session: Recording
+    if kind == _SCENE:
+        session = _open_scene(address, stated)
+    else:
+        usual = "mouse" if kind in _SEQUENCES else ""
+        animal = _ANIMALS.get(kind) or stated.pop("animal", usual)
+        if not animal:
+            raise RecordingError(
+                f"{address} lacks the animal that moves, as in "
+                "synthetic:move?animal=snake.toml&seed=3"
+            )
+        skeleton = Skeleton.load(animal)
+        world = world_of(skeleton)
+        values = _values(address, stated, _settings(kind, skeleton.length))
+        if kind in _SEQUENCES:
+            values["n_frames"] = values.pop("frames", None)
+            session = tracking_sequence(world, _SEQUENCES[kind], **values)
+        else:
+            seed = values.pop("seed", 0)
+            n_frames = values.pop("frames", 300)
+            session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
+    if camera is not None:
+        session.camera = fitting(
+            camera, session.width, session.height, "the camera that was stated"
+        )
+    return session
+
+
+def _open_scene(address: str, stated: dict[str, str]) -> Recording:
+    """The recording of a scene's address."""
+    named = stated.pop("name", "plain")
+    if named not in SCENES:
+        near = difflib.get_close_matches(named, SCENES, 1, cutoff=0.0)[0]
+        raise RecordingError(
+            f"{address}: there is no scene {named}, the nearest one is {near}; known are "
+            f"{', '.join(SCENES)}"
+        )
+    plan, _ = SCENES[named]
+    kind = next(kind for kind, animal in _ANIMALS.items() if animal == plan)
+    settings = _settings(kind, Skeleton.load(plan).length, _MOST_SCENE_FRAMES)
+    if plan != "mouse":
+        settings.pop("sensor", None)
+    settings["build"] = (str, lambda build: build in _BUILDS, f"one of {', '.join(_BUILDS)}")
+    values = _values(address, stated, settings)
+    seed = values.pop("seed", 0)
+    if seed >= SEALED_FROM:
+        raise RecordingError(
+            f"{address}: seeds from {SEALED_FROM} on are kept for `liex evaluate scenes --sealed`; "
+            "take a smaller one"
+        )
+    family = values.pop("build", _BUILDS[0])
+    return film(named, seed, values.pop("frames", 300), family=family, **values)
+
+
+def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting]) -> dict[str, Any]:
+    """The values of an address's settings, validated against the settings of its kind."""
+    values = {}
+    for key, text in stated.items():
+        if key not in settings:
+            near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
+            raise RecordingError(
+                f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}"
+            )
+        read, holds, expected = settings[key]
+        try:
+            values[key] = read(text)
+        except (KeyError, ValueError):
+            values[key] = None
+        if values[key] is None or not holds(values[key]):
+            raise RecordingError(
+                f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}"
+            )
+    return values
+
+
+_Setting = tuple[Callable[[str], Any], Callable[[Any], bool], str]
+
+
+def _settings(kind: str, home_mm: float, most_frames: int = _MOST_FRAMES) -> dict[str, _Setting]:
+    """For each setting: its parser, its check, and the expected value for the error message."""
+    low, high = (
+        (30.0, 150.0)
+        if kind == "walk"
+        else (round(f * home_mm, -int(home_mm > 100)) for f in _SIZES)
+    )
+    settings: dict[str, _Setting] = {
+        "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),
+        "frames": (int, lambda n: 1 <= n <= most_frames, f"a whole number from 1 to {most_frames}"),
+        "spine_mm": (float, lambda mm: low <= mm <= high, f"a length from {low:g} to {high:g} mm"),
+    }
+    if sensors := _SENSORS.get(kind):
+        known = {name: BY_NAME[name] for name in sensors}
+        settings["sensor"] = (known.__getitem__, bool, f"one of {', '.join(sensors)}")
+    return settings

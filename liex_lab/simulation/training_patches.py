@@ -13,34 +13,35 @@ a plane in a pinhole image.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
-from liex_lab.body.surface import Body, Surface
+from liex_lab.body.shape import Body, BodyShape
+from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
+from liex_lab.runtime.shapes import Rows
 from liex_lab.runtime.threads import threads
 from liex_lab.simulation import _render_kernels as render_kernels
-from liex_lab.simulation._sensor_kernels import EROSION, NOISE, NORMAL
+from liex_lab.simulation._sensor_kernels import ANIMAL, EROSION, NOISE, NORMAL, OBJECT
 from liex_lab.simulation.scene import PART_FACES, SceneSpec, draw_views, rounded
-from liex_lab.simulation.scenes.meshes import draw_worn
+from liex_lab.simulation.scenes.places import Mesh, draw_worn, joined
 from liex_lab.simulation.species import MouseSpecies, Species
 
 Array = NDArray[np.float64]
 
 PER_SESSION = 8
 BLOCK = 512  # images made from one generator
-_THING_SHARE = 0.10
+_OBJECT_SHARE = 0.10
 _WALL_SHARE = 0.35
 
 
 @dataclass(frozen=True)
-class TrainingPatches:
+class TrainingPatches(Rows):
     """Depth patches of S x S pixels around an animal, n of them, with their truth.
 
     Attributes:
@@ -88,51 +89,14 @@ class TrainingPatches:
         """Number of patches n."""
         return len(self.depth)
 
-    def __getitem__(self, index: slice | NDArray[np.int64]) -> TrainingPatches:
-        """A subset of the patches.
-
-        Args:
-            index: slice, mask or row numbers over the patches.
-        """
-        picked: list[Any] = []
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, SE3):
-                value = SE3(value.rotation[index], value.translation[index])
-            picked.append(value[index] if isinstance(value, np.ndarray) else value)
-        return TrainingPatches(*picked)
-
-    @staticmethod
-    def joined(parts: list[TrainingPatches]) -> TrainingPatches:
-        """Concatenate several sets.
-
-        Args:
-            parts: at least one set; `unit_mm` and `own_bones` are those of the first.
-        """
-        columns: list[Any] = []
-        for field in fields(TrainingPatches):
-            values: list[Any] = [getattr(part, field.name) for part in parts]
-            if isinstance(values[0], SE3):
-                columns.append(
-                    SE3(
-                        np.concatenate([v.rotation for v in values]),
-                        np.concatenate([v.translation for v in values]),
-                    )
-                )
-            elif isinstance(values[0], float | bool):  # shared by all images
-                columns.append(values[0])
-            else:
-                columns.append(np.concatenate(values))
-        return TrainingPatches(*columns)
-
 
 @dataclass(frozen=True)
-class _Views:
+class _Views(Rows):
     """Camera, floor, sensor and animal of n images, one row each, constant in a mini-session."""
 
     sensor: NDArray[np.int64]
     intrinsics: Array
-    picture: NDArray[np.int64]
+    size_px: NDArray[np.int64]
     T_arena_camera: SE3
     parameters: Array
     size: Array
@@ -142,18 +106,7 @@ class _Views:
 
 
 def training_windows(
-    seed: int,
-    n: int,
-    species: Species | None = None,
-    *,
-    family: str = "train",
-    noise: float = 1.0,
-    erosion_px: int = 0,
-    degraded_share: float = 0.0,
-    spine_mm: float | None = None,
-    window_px: int = 144,
-    parallel: bool = True,
-    worn_share: float = 0.0,
+    seed: int, n: int, species: Species | None = None, **settings: Any
 ) -> TrainingPatches:
     """The first n training patches of a seed, as made by `training_blocks`.
 
@@ -161,36 +114,13 @@ def training_windows(
         seed: of the whole set.
         n: number of patches; whole blocks are rendered and the last one is cut.
         species: the species; None is a mouse.
-        family: of body shapes, one of `body.shape.FAMILIES`.
-        noise: multiplies the sensor's random errors and its rate of holes.
-        erosion_px: pixels stripped off the animal's outline.
-        degraded_share: share of mini-sessions with more noise; half of them also have more erosion.
-        spine_mm: mean length of the animals, mm; None uses the skeleton's own.
-        window_px: side of the patches, px.
-        parallel: render on all threads.
-        worn_share: share of mice with a head stage or a cable.
+        **settings: further keyword arguments of `training_blocks`.
 
     Returns:
         n patches with their truth.
     """
-    parts = []
-    left = n
-    for block in training_blocks(
-        seed,
-        -(-n // BLOCK),
-        species,
-        family=family,
-        noise=noise,
-        erosion_px=erosion_px,
-        degraded_share=degraded_share,
-        spine_mm=spine_mm,
-        window_px=window_px,
-        parallel=parallel,
-        worn_share=worn_share,
-    ):
-        parts.append(block if left >= BLOCK else block[:left])
-        left -= BLOCK
-    return TrainingPatches.joined(parts)
+    blocks = training_blocks(seed, -(-n // BLOCK), species, **settings)
+    return TrainingPatches.join(list(blocks))[:n]
 
 
 def training_blocks(
@@ -228,7 +158,7 @@ def training_blocks(
             for mice of up to 70 mm.
         parallel: render on all threads.
         worn_share: share of mini-sessions whose mouse has a head stage or a cable, see
-            `scenes.meshes.draw_worn`; 0 gives the same patches as without this option.
+            `scenes.places.draw_worn`; 0 gives the same patches as without this option.
         per_session: images of one animal with one camera, a divisor of `BLOCK`.
 
     Yields:
@@ -238,7 +168,7 @@ def training_blocks(
     surface = Surface.of(species.skeleton)
     for number in range(first, first + n_blocks):
         rng = np.random.default_rng([seed, number])
-        views = _draw_looks(
+        views = _draw_views(
             rng, species, family, noise, erosion_px, degraded_share, spine_mm, per_session
         )
         wearing = (np.random.default_rng([seed, number, 1]), worn_share)
@@ -269,11 +199,11 @@ def drawn_bodies(
         per_session: images of one animal with one camera.
     """
     rng = np.random.default_rng([seed, number])
-    looks = _draw_looks(rng, species, family, 1.0, 0, degraded_share, spine_mm, per_session)
-    return looks.shape[np.arange(0, BLOCK, per_session)]
+    views = _draw_views(rng, species, family, 1.0, 0, degraded_share, spine_mm, per_session)
+    return views.shape[::per_session]
 
 
-def _draw_looks(
+def _draw_views(
     rng: np.random.Generator,
     species: Species,
     family: str,
@@ -289,7 +219,7 @@ def _draw_looks(
     sensor = np.arange(m) % len(species.sensors)
     shape = species.shapes(rng, family, m)
     intrinsics = np.empty((m, 4))
-    picture = np.empty((m, 2), np.int64)
+    size_px = np.empty((m, 2), np.int64)
     parameters = np.empty((m, 0))
     for k, kind in enumerate(species.sensors):
         rows = sensor == k
@@ -299,28 +229,28 @@ def _draw_looks(
         focal = rng.uniform(0.97, 1.03, (m, 1)) * [camera.fx, camera.fy]
         axis = rng.normal(0.0, 4.0, (m, 2)) + np.array([camera.cx, camera.cy])
         intrinsics[rows] = np.concatenate([focal, axis], axis=1)[rows]
-        picture[rows] = camera.width, camera.height
+        size_px[rows] = camera.width, camera.height
         drawn = kind.coarse(kind.draw(rng, m, shape.fur, noise, erosion_px))
         parameters = drawn if not parameters.size else np.where(rows[:, None], drawn, parameters)
-    _degrade(rng, parameters, degraded_share)
+    degrade(rng, parameters, degraded_share)
     nominal = skeleton.length if spine_mm is None else spine_mm
-    each = np.repeat(np.arange(m), per_session)
     T_arena_camera = draw_views(rng, m, species.setting)
     scale = species.setting.scale
-    return _Views(
-        sensor[each],
-        intrinsics[each],
-        picture[each],
-        SE3(T_arena_camera.rotation[each], T_arena_camera.translation[each]),
-        parameters[each],
-        (nominal / skeleton.length * rng.uniform(*species.sizes, m))[each],
-        shape[each],
-        scale * rng.uniform(0.0, 1.0, m)[each],
-        (rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale])[each],
+    views = _Views(
+        sensor,
+        intrinsics,
+        size_px,
+        T_arena_camera,
+        parameters,
+        nominal / skeleton.length * rng.uniform(*species.sizes, m),
+        shape,
+        scale * rng.uniform(0.0, 1.0, m),
+        rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale],
     )
+    return views[np.repeat(np.arange(m), per_session)]
 
 
-def _degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
+def degrade(rng: np.random.Generator, parameters: Array, share: float) -> None:
     """Give a share of the sensors more noise and holes, and half of those an eroded outline."""
     m = len(parameters)
     worse = rng.random(m) < share
@@ -360,22 +290,6 @@ def inverse_depth_plane(
     )
 
 
-def _with_worn(
-    thing: Array,
-    has_thing: NDArray[np.bool_],
-    worn: Array,
-    worn_faces: NDArray[np.int32],
-    wears: NDArray[np.bool_],
-) -> tuple[Array, NDArray[np.int32], NDArray[np.bool_]]:
-    """Neighbours and equipment as one mesh (n, V, 3); absent parts are far behind the camera."""
-    away = np.array([0.0, 0.0, 1e7])
-    both = [
-        mesh + (~there)[:, None, None] * away for mesh, there in ((thing, has_thing), (worn, wears))
-    ]
-    faces = np.concatenate([PART_FACES, worn_faces + np.int32(thing.shape[1])])
-    return np.concatenate(both, axis=1), faces, has_thing | wears
-
-
 def _draw_block(
     rng: np.random.Generator,
     species: Species,
@@ -398,10 +312,10 @@ def _draw_block(
     trunk = vertices[:, : surface.n_trunk_vertices]
     T_camera_arena = views.T_arena_camera.inverse()
     origin = window_origin(trunk, T_camera_arena, views.intrinsics, window_px)
-    thing, has_thing = _draw_neighbours(
+    item, has_object = _draw_neighbours(
         rng, trunk, views.size * skeleton.length, scale, species.floats
     )
-    thing_faces = PART_FACES
+    objects = Mesh(item, PART_FACES)
     if wearing[1] > 0.0:
         if not isinstance(views.shape, BodyShape):
             raise LiexError(
@@ -409,16 +323,23 @@ def _draw_block(
                 "leave out worn_share"
             )
         per_session = int(np.sum(sessions == sessions[0]))
-        worn = draw_worn(wearing[0], skeleton, pose, views.shape, girth, wearing[1], per_session)
-        thing, thing_faces, has_thing = _with_worn(thing, has_thing, *worn)
+        worn, wears = draw_worn(
+            wearing[0], skeleton, pose, views.shape, girth, wearing[1], per_session
+        )
+        absent = np.stack([~has_object, ~wears])[..., None, None] * np.array([0.0, 0.0, 1e7])
+        objects = joined(
+            [Mesh(item + absent[0], PART_FACES), Mesh(worn.vertices + absent[1], worn.faces)]
+        )
+        has_object = has_object | wears
     walls = _draw_walls(rng, trunk, species.setting)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     depth = np.empty((n, window_px, window_px), np.uint16)
     background = np.empty_like(depth)
     with threads(parallel):
         render_kernels.draw_windows(
-            render_kernels.Meshes(vertices, surface.faces, thing, thing_faces, has_thing),
-            render_kernels.PatchCamera(views.intrinsics, views.picture, origin),
+            render_kernels.part_of(vertices, surface.faces, ANIMAL),
+            render_kernels.part_of(objects.vertices, objects.faces, OBJECT, has_object),
+            render_kernels.PatchCamera(views.intrinsics, views.size_px, origin),
             render_kernels.ArenaView(
                 views.T_arena_camera.rotation,
                 views.T_arena_camera.translation[:, 2].copy(),
@@ -429,7 +350,7 @@ def _draw_block(
             depth,
             background,
         )
-    seen = pose.moved(T_camera_arena)
+    visible = pose.moved(T_camera_arena)
     return TrainingPatches(
         depth,
         background,
@@ -438,10 +359,10 @@ def _draw_block(
         inverse_depth_plane(views.T_arena_camera, views.intrinsics, views.floor_error),
         inverse_depth_plane(views.T_arena_camera, views.intrinsics),
         views.T_arena_camera,
-        seen.root,
-        seen.angles,
-        seen.scale,
-        seen.joints(skeleton),
+        visible.root,
+        visible.angles,
+        visible.scale,
+        visible.joints(skeleton),
         views.size * skeleton.length,
         sessions,
         views.sensor,
@@ -460,7 +381,7 @@ def _place(rng: np.random.Generator, species: Species, pose: Pose, views: _Views
     height = T.translation[:, 2] - (middle[:, 2] if species.floats else 0.0)
     margin = 0.85 * pose.scale * skeleton.length * views.intrinsics[:, 0] / height + 6.0
     uv = np.stack(
-        [margin + rng.random(n) * (views.picture[:, k] - 2.0 * margin) for k in range(2)],
+        [margin + rng.random(n) * (views.size_px[:, k] - 2.0 * margin) for k in range(2)],
         axis=-1,
     )
     ray = np.concatenate(
@@ -522,7 +443,7 @@ def _draw_neighbours(
     power = np.where(rng.random(n) < 0.5, 2.0, 10.0)
     return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(
         n
-    ) < _THING_SHARE
+    ) < _OBJECT_SHARE
 
 
 def _draw_walls(rng: np.random.Generator, trunk: Array, setting: SceneSpec) -> Array:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import place_joints
-from liex_lab.body.kinematics import KinematicTree
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import Allocator, blocks

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
 from liex_lab.runtime.kernels import kernel
@@ -103,7 +104,7 @@ class BodyResidual:
         if not out.size:
             return BodyAgreement(*out)
         across = pose_arena.scale
-        if self.size is not None and self.surface.shape is not None:
+        if self.size is not None and isinstance(self.surface.body, BodyShape):
             across = self.size * np.sqrt(self.size / across)
         rendered = render_crops(self.surface, pose_arena, self.girth * across, crops, scene)
         planes = scene.planes(crops, self.camera_view)

@@ -38,8 +38,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.kinematics import KinematicTree
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.tracking import _smoother_kernels as kernels

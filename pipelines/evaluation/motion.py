@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import joint_reaches
 from liex_lab.errors import LiexError
 from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.progress import Progress, silent
@@ -390,7 +389,7 @@ def on_back(skeleton: Skeleton, bodies: Bodies, along: Array, above: float) -> A
     pose, girth, shape = bodies
     frames = pose.frames(skeleton)
     joints, upwards = frames.translation, frames.rotation[..., 2]
-    reach = joint_reaches(skeleton)
+    reach = skeleton.reach / skeleton.length
     bone = np.clip(np.searchsorted(reach, along, side="right") - 1, 0, len(reach) - 2)
     share = ((along - reach[bone]) / (reach[bone + 1] - reach[bone]))[:, None]
     axis = joints[:, bone] + share * (joints[:, bone + 1] - joints[:, bone])

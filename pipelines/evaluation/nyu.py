@@ -30,7 +30,7 @@ from liex_lab.recordings.formats.images.nyu import (
     points_of_joints,
 )
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.hand.pose_prior import SEEN_SHARE
+from liex_lab.simulation.hand.pose_prior import OBSERVED_SHARE
 
 from ..build import build_estimator, build_recording, build_scene
 
@@ -176,7 +176,7 @@ def shown_hands(
 def labels_used(numbers: Numbers) -> str:
     """A sentence on test labels in our hand model, for frame numbers (n,) from 1 on."""
     n = int((numbers <= N_FIRST_PERSON).sum())
-    return _LABELS.format(share=100 * SEEN_SHARE, last=N_FIRST_PERSON, n=n, of=len(numbers))
+    return _LABELS.format(share=100 * OBSERVED_SHARE, last=N_FIRST_PERSON, n=n, of=len(numbers))
 
 
 def frame_numbers_in(folder: Path, n_labelled: int) -> Numbers:

@@ -25,7 +25,7 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import verdict_in
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, film
-from liex_lab.simulation.scenes.recording import TrueAnimal
+from liex_lab.simulation.scenes.stage import TrueAnimal
 
 from ..arenas import run_arenas
 from ..build import plan_of, propose_arenas

@@ -55,9 +55,8 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.sessions import Session
 from liex_lab.sessions.folder import folder_bytes
-from liex_lab.simulation.address import open_synthetic
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.simulation.simulator import world_of
+from liex_lab.simulation.simulator import open_synthetic, world_of
 
 from ..build import build_scene, plan_of
 from ..convert import convert

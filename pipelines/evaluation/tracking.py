@@ -41,7 +41,7 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import Segmenter
-from liex_lab.simulation import simulator, tracking_sequences
+from liex_lab.simulation import simulator
 from liex_lab.tracking.curve import OnlineTracker
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.particles import SEARCHED, ParticleFilter, ProcessNoise
@@ -53,7 +53,7 @@ from ..build import build_scene, plan_of
 from ..training.pose_model import estimator_of
 
 Array = NDArray[np.float64]
-Draw = Callable[[tracking_sequences.TestSequence, dict[str, Followed]], object]
+Draw = Callable[[simulator.TestSequence, dict[str, Followed]], object]
 
 ROWS = {
     "single": "single frames",
@@ -113,7 +113,7 @@ def evaluate_tracking(
     plan = plan_of(animal)
     estimator = estimator_of(animal, "default", progress, *(() if model is None else (model,)))
     rival = estimator_of(animal, "paper", progress) if paper else None
-    recording = tracking_sequences.tracking_sequence(world, sequence, seed=seed, n_frames=n_frames)
+    recording = simulator.tracking_sequence(world, sequence, seed=seed, n_frames=n_frames)
     rows, speed = follow_sequence(recording, estimator, plan, progress)
     if rival is not None:
         rows |= paper_rows(recording, rival, plan, progress)
@@ -139,7 +139,7 @@ def evaluate_tracking(
 
 
 def follow_sequence(
-    recording: tracking_sequences.TestSequence,
+    recording: simulator.TestSequence,
     estimator: PoseEstimator,
     plan: Plan,
     progress: Progress = silent,
@@ -202,7 +202,7 @@ def _online(tracker: FrameTracker, observed: Observations) -> Track:
     return Track.join([part for part in (online.add(observed), online.close()) if part is not None])
 
 
-def _speed(tracker: FrameTracker, recording: tracking_sequences.TestSequence) -> dict[str, float]:
+def _speed(tracker: FrameTracker, recording: simulator.TestSequence) -> dict[str, float]:
     """Frames/s of the default tracker, on one core and on all.
 
     From depth images in memory to the smoothed track: the best of alternating repeats over the
@@ -220,7 +220,7 @@ def _speed(tracker: FrameTracker, recording: tracking_sequences.TestSequence) ->
 
 
 def paper_rows(
-    recording: tracking_sequences.TestSequence,
+    recording: simulator.TestSequence,
     paper: PoseEstimator,
     plan: Plan,
     progress: Progress = silent,
@@ -239,7 +239,7 @@ def paper_rows(
 
 
 def follow(
-    recording: tracking_sequences.TestSequence,
+    recording: simulator.TestSequence,
     estimator: PoseEstimator,
     scene: Segmenter,
     size: float,
@@ -274,7 +274,7 @@ def follow(
 
 
 def _single(
-    recording: tracking_sequences.TestSequence, paper: PoseEstimator, scene: Segmenter, size: float
+    recording: simulator.TestSequence, paper: PoseEstimator, scene: Segmenter, size: float
 ) -> Followed:
     """Algorithm 1 on each frame by itself."""
     joints, error = [], []
@@ -289,7 +289,7 @@ def _single(
 
 
 def _followed(
-    recording: tracking_sequences.TestSequence,
+    recording: simulator.TestSequence,
     estimator: PoseEstimator,
     joints: Array,
     error: Array,
@@ -351,13 +351,13 @@ def search_noise(
     world = simulator.world_of(skeleton)
     sequences = []
     for kind, seed in product(_KINDS, _SEARCH_SEEDS):
-        recording = tracking_sequences.tracking_sequence(world, kind, seed=seed, n_frames=n_frames)
+        recording = simulator.tracking_sequence(world, kind, seed=seed, n_frames=n_frames)
         n_sample = plan.foreground.n_background_frames
         scene, sample = build_scene(recording, plan, skeleton, n_sample)
         sequences.append((recording, scene, estimator.find_size(sample, scene)))
 
     def mean_mm(
-        followed: Callable[[tracking_sequences.TestSequence, Segmenter, float], Followed],
+        followed: Callable[[simulator.TestSequence, Segmenter, float], Followed],
     ) -> float:
         """Mean error over the frames in view of all sequences."""
         errors = [followed(*s).in_view(s[0].events, s[0].spine_mm) for s in sequences]

@@ -38,9 +38,14 @@ from liex_lab.simulation import agents
 from liex_lab.simulation._render_kernels import WALL_COLUMNS
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
-from liex_lab.simulation.agents.agent import STEP_S, CameraPath, Individual, Motion, render_agent
-from liex_lab.simulation.fish import FishSpecies
-from liex_lab.simulation.species import MouseSpecies
+from liex_lab.simulation.agents.agent import (
+    STEP_S,
+    ActedMotion,
+    CameraPath,
+    Individual,
+    render_agent,
+)
+from liex_lab.simulation.species import FishSpecies, MouseSpecies
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Subject
@@ -209,7 +214,7 @@ def act(
     if scenario.filmed_s:
         n = int(np.searchsorted(rows * STEP_S, scenario.filmed_s))
     times = np.round(rows[:n] * STEP_S * 1e9).astype(np.int64)
-    whole = Camera(*camera.intrinsics, *(int(x) for x in camera.picture))
+    whole = Camera(*camera.intrinsics, *(int(x) for x in camera.size_px))
     return AgentTrack(
         tracker.observe(rendered(rng, stage, slice(n), window_px), times, size),
         tracker.subject(whole, sample.floor(0).T_arena_camera, size),
@@ -222,7 +227,7 @@ def act(
 
 
 Staged = tuple[
-    Motion,
+    ActedMotion,
     NDArray[np.int64],
     Pose,
     Array,

@@ -36,7 +36,7 @@ from liex_lab.evaluation.scores import Followed
 from liex_lab.geometry import SE3, so3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation import corruptions, simulator, tracking_sequences
+from liex_lab.simulation import corruptions, simulator
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
@@ -173,7 +173,7 @@ def measure(
     Returns:
         Observations and truth in the estimated arena frame.
     """
-    recording = tracking_sequences.tracking_sequence(
+    recording = simulator.tracking_sequence(
         simulator.world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
     )
     estimator = estimator_of(animal, "default", progress)

@@ -59,6 +59,7 @@ from liex_lab.scene.hand_segmenter import HandPatches
 from liex_lab.scene.height_maps import HeightMaps, Patches, moment_columns, view_of
 from liex_lab.sessions.provenance import package_version
 from liex_lab.simulation import simulator, training_patches
+from liex_lab.simulation.species import GenericSpecies
 
 Array = NDArray[np.float64]
 
@@ -144,10 +145,12 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
         skeleton: the animal's skeleton.
     """
     world = simulator.world_of(skeleton)
-    if not isinstance(world, simulator.GenericSimulator):
+    if not (
+        isinstance(world, simulator.BodySimulator) and isinstance(world.species, GenericSpecies)
+    ):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
     sizes = tuple(
-        (factor * skeleton.length, world.window_px(factor * skeleton.length))
+        (factor * skeleton.length, world.species.window_px(factor * skeleton.length))
         for factor in _OWN_SIZES
     )
     sizes = sizes if variant == "default" else sizes[:1]

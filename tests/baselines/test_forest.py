@@ -22,15 +22,14 @@ from liex_lab.baselines.baseline import (
     train_forests,
     with_home_turn,
 )
-from liex_lab.body.kinematics import KinematicTree
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
-from liex_lab.simulation.hand.pose_prior import draw_seen
+from liex_lab.simulation.hand.pose_prior import draw_observed
 from tests.estimation.toy import FLOOR, SCENE, Toy, toy_mice, trained, training_set, unseen
 
 PAPER = METHODS["paper"]
@@ -107,7 +106,7 @@ def test_a_hand_that_shows_its_palm_is_near_the_pose_that_f2_begins_at():
     """From an upright start it is turned by half a turn, and F2 would not learn from it."""
     skeleton = Skeleton.load("hand")
     turn = training_of("rf", skeleton).plan.home_turn
-    _, turns = draw_seen(np.random.default_rng(0), skeleton, 400)
+    _, turns = draw_observed(np.random.default_rng(0), skeleton, 400)
     headings = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
     flat = so3.exp(np.stack([0 * headings, 0 * headings, headings], axis=1))
     off = [

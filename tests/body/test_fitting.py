@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.fitting import Fit, _after_step, _jacobian, fit_poses
+from liex_lab.body.pose import Fit, KinematicTree, _after_step, _jacobian, fit_poses
 from liex_lab.geometry import SE3, so3
 
 HAND = Skeleton.load("hand")
-FREE = [(j, k) for j in range(1, HAND.n_joints) for k in range(3) if HAND.axes[j, k]]
+FREE = KinematicTree.of(HAND).free
 
 
 def hands(n: int, seed: int, share: float = 0.8) -> Pose:

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.mesh import MeshBody
-from liex_lab.body.surface import Surface, vary_body
+from liex_lab.body.shape import MeshBody
+from liex_lab.body.surface import Surface
+from liex_lab.body.variation import vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
+from liex_lab.simulation import training_patches
 from liex_lab.simulation.simulator import world_of
 
 SNAKE = Skeleton.load(find_sample("snake.toml"))
@@ -80,9 +82,8 @@ def test_a_bent_body_lies_where_the_capsules_lie(meshed):
 def test_bodies_move_rigidly_and_grow_with_scale(meshed):
     surface, pose = Surface.of(meshed), winding(4)
     T = SE3.exp(np.array([0.3, -0.2, 1.0, 5.0, 6.0, 7.0]))
-    many = SE3(np.tile(T.rotation, (4, 1, 1)), np.tile(T.translation, (4, 1)))
-    moved = Pose(many @ pose.root, pose.angles, pose.scale)
-    np.testing.assert_allclose(surface.vertices(moved), T @ surface.vertices(pose), atol=1e-9)
+    moved = surface.vertices(pose.moved(T))
+    np.testing.assert_allclose(moved, T @ surface.vertices(pose), atol=1e-9)
     home = Pose.home(meshed)
     doubled = replace(home, scale=np.array(2.0))
     np.testing.assert_allclose(surface.vertices(doubled), 2.0 * surface.vertices(home), atol=1e-9)
@@ -98,7 +99,8 @@ def test_individuals_differ_in_girth_and_not_in_length(meshed):
     assert 0.05 < width.std() / width.mean() < 0.5
 
 
-def test_training_pictures_show_the_mesh(meshed):
+def test_training_patches_show_the_mesh(meshed, monkeypatch):
+    monkeypatch.setattr(training_patches, "BLOCK", 64)
     (windows,) = world_of(meshed).training_blocks(3, 1, first=0, family="augmented", window_px=120)
     stands = (windows.depth > 0) & (windows.background - windows.depth > 4.0)
     assert stands.reshape(len(stands), -1).any(axis=1).mean() > 0.95

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.body import pose as pose_module
-from liex_lab.body.pose import PlacedPose, Pose
+from liex_lab.body.pose import KinematicTree, PlacedPose, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.method import METHODS
 from liex_lab.estimation.model import ErrorCalibration
@@ -45,31 +44,29 @@ def test_a_placed_pose_in_another_frame_is_placed_anew():
     np.testing.assert_allclose(moved.joints(MOUSE), T @ pose.joints(MOUSE), atol=1e-9)
 
 
-@pytest.mark.parametrize("animal", ["mouse", "hand"])
-def test_choosing_a_pose_runs_forward_kinematics_once_for_all_who_ask_for_its_joints(
-    animal, monkeypatch
-):
-    skeleton = Skeleton.load(animal)
-    home = Pose.home(skeleton, 3, 4).frames(skeleton)
-    runs = []
-    real = pose_module.forward_kinematics
-
-    def counted(*what):
-        runs.append(what)
-        return real(*what)
-
-    monkeypatch.setattr(pose_module, "forward_kinematics", counted)
+def test_chosen_poses_keep_the_frames_of_their_joints():
+    home = Pose.home(MOUSE, 3, 4).frames(MOUSE)
     scores = np.random.default_rng(1).uniform(1, 9, (3, 4))
     picked = choose(
-        skeleton,
-        METHODS["default"],
-        ErrorCalibration(),
-        1.0,
-        home.rotation,
-        home.translation,
-        scores,
+        MOUSE, METHODS["default"], ErrorCalibration(), 1.0, home.rotation, home.translation, scores
     )
-    kept = picked.pose.frames(skeleton)
-    assert len(runs) == 1
-    placed = Pose(picked.pose.root, picked.pose.angles, picked.pose.scale).frames(skeleton)
-    np.testing.assert_array_equal(kept.rotation, placed.rotation)
+    assert isinstance(picked.pose, PlacedPose)
+    plain = Pose(picked.pose.root, picked.pose.angles, picked.pose.scale)
+    np.testing.assert_array_equal(picked.pose.frames(MOUSE).rotation, plain.frames(MOUSE).rotation)
+
+
+@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+def test_the_free_angles_are_those_of_the_joints_beyond_the_base_in_their_order(animal):
+    skeleton = Skeleton.load(animal)
+    tree = KinematicTree.of(skeleton)
+    expected = [
+        (joint, axis)
+        for joint in range(1, skeleton.n_joints)
+        for axis in range(3)
+        if skeleton.axes[joint, axis]
+    ]
+    assert [tuple(row) for row in tree.free.tolist()] == expected
+    assert len(tree.free) == skeleton.dof - 6
+    np.testing.assert_array_equal(np.flatnonzero(tree.turning), skeleton.solved)
+    skeleton.axes[1:] = False  # all base
+    assert KinematicTree.of(skeleton).free.shape == (0, 2)

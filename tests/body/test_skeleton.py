@@ -10,26 +10,20 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.kinematics import aim
+from liex_lab.body.pose import aim
 from liex_lab.body.skeleton import PRESETS, CameraView
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3, so3
 from liex_lab.geometry.se3 import product_of_exponentials
 
 
-@pytest.mark.parametrize(
-    ("animal", "joints", "dof"), [("fish", 21, 25), ("mouse", 5, 12), ("hand", 23, 26)]
-)
-def test_presets_have_the_papers_joints_and_degrees_of_freedom(animal, joints, dof):
-    skeleton = Skeleton.load(animal)
-    assert (skeleton.n_joints, skeleton.dof) == (joints, dof)
-
-
-def test_the_mouse_has_the_bone_ratios_of_the_published_tracks():
-    skeleton = Skeleton.load("mouse")
-    bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
+def test_presets_have_the_papers_joints_and_degrees_of_freedom_and_bone_ratios():
+    skeletons = [Skeleton.load(animal) for animal in ("fish", "mouse", "hand")]
+    assert [(s.n_joints, s.dof) for s in skeletons] == [(21, 25), (5, 12), (23, 26)]
+    mouse = skeletons[1]
+    bones = np.linalg.norm(mouse.offsets[1:], axis=1)
     np.testing.assert_allclose(bones / bones.sum(), [0.2440, 0.2090, 0.2256, 0.3214], atol=1e-4)
-    assert skeleton.length == pytest.approx(52.834, abs=1e-3)
+    assert mouse.length == pytest.approx(52.834, abs=1e-3)
 
 
 def test_published_mouse_poses_are_poses_of_our_skeleton(reference_data):
@@ -93,10 +87,19 @@ def test_aiming_turns_one_direction_onto_the_other_even_when_they_are_opposite()
     ("change", "says"),
     [
         (lambda t: t["joints"][2].update(parent="nose"), "listed before"),
+        (lambda t: t["joints"][0].update(parent="nose"), "has no parent, got 'nose'"),
         (lambda t: t["joints"][1].update(axes=["jaw"]), "axes is a list out of"),
         (lambda t: t["joints"][1].update(lenght=3), "unknown key 'lenght'"),
         (lambda t: t["joints"][1].update(offset_mm=[1, 2]), "three numbers"),
         (lambda t: t.pop("joints"), "at least one"),
+        (lambda t: t.update(joints=t["joints"][:1]), "a second joint at some distance"),
+        (lambda t: t.update(view={"frame": "above"}), "one of floor, camera, got 'above'"),
+        (lambda t: t.update(view={"foreground": 3}), "one of background, nearest, got 3"),
+        (lambda t: t.update(view={"behind": 3}), "unknown key 'behind'"),
+        (lambda t: t.update(view={"behind_mm": -1}), "behind_mm is a positive number"),
+        (lambda t: t.update(view={"smooth_mm": True}), "smooth_mm is a positive number"),
+        (lambda t: t.update(view={"area": [0.3]}), "two rising positive numbers"),
+        (lambda t: t.update(view={"area": [0.3, 0.1]}), "two rising positive numbers"),
     ],
 )
 def test_a_mistake_in_a_skeleton_is_named(change, says):
@@ -123,25 +126,3 @@ def test_a_view_follows_from_the_animals_size_unless_the_toml_states_it():
     assert [large.behind_mm, large.smooth_mm, large.min_height_mm] == pytest.approx(
         [360.0, 6.0, 7.0]
     )
-
-
-@pytest.mark.parametrize(
-    ("view", "says"),
-    [
-        ({"frame": "above"}, "one of floor, camera, got 'above'"),
-        ({"behind": 3}, "unknown key 'behind'"),
-        ({"behind_mm": -1}, "behind_mm is a positive number"),
-        ({"smooth_mm": True}, "smooth_mm is a positive number"),
-        ({"area": [0.3]}, "two rising positive numbers"),
-        ({"area": [0.3, 0.1]}, "two rising positive numbers"),
-    ],
-)
-def test_a_mistake_in_a_view_is_named(view, says):
-    table = {**Skeleton.load("mouse").table, "view": view}
-    with pytest.raises(LiexError, match=says):
-        Skeleton.from_table(table, "mine.toml")
-
-
-def test_a_skeleton_of_one_point_is_refused():
-    with pytest.raises(LiexError, match="a second joint at some distance"):
-        Skeleton.from_table({"name": "dot", "joints": [{"name": "only"}]}, "dot.toml")

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.shape import FAMILIES, BodyShape, draw_shapes, draw_tail_bends
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Surface
+from liex_lab.body.variation import FAMILIES, draw_hands, draw_shapes, draw_tail_bends, vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
@@ -27,24 +28,15 @@ def on_floor(n: int, scale: float = 1.23, height_mm: float = 20.0) -> Pose:
     return Pose(pose.root, pose.angles, np.full(n, scale))
 
 
-def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return float(np.sum(np.cross(a, b) * c) / 6.0)
-
-
 @pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
-def test_every_edge_joins_two_triangles_that_run_opposite_ways(animal: str) -> None:
-    surface = Surface.of(Skeleton.load(animal))
+def test_triangles_close_the_surface_and_face_outward(animal: str) -> None:
+    skeleton = Skeleton.load(animal)
+    surface = Surface.of(skeleton)
     edges = Counter((int(f[k]), int(f[(k + 1) % 3])) for f in surface.faces for k in range(3))
     assert set(edges.values()) == {1}
     assert all((b, a) in edges for a, b in edges)
-
-
-@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
-def test_triangles_face_outward(animal: str) -> None:
-    skeleton = Skeleton.load(animal)
-    surface = Surface.of(skeleton)
-    assert volume(surface.vertices(Pose.home(skeleton)), surface.faces) > 0
+    a, b, c = np.moveaxis(surface.vertices(Pose.home(skeleton))[surface.faces], 1, 0)
+    assert np.sum(np.cross(a, b) * c) > 0  # the volume
 
 
 def test_an_adult_mouse_is_as_wide_and_high_as_the_preset_says() -> None:
@@ -57,30 +49,19 @@ def test_an_adult_mouse_is_as_wide_and_high_as_the_preset_says() -> None:
         trunk[:, 0].max(), 65.0, atol=0.1
     )  # the nose joint is the nose's tip
     np.testing.assert_allclose(trunk[:, 0].min(), 65.0 * STATIONS[0], atol=0.1)
-
-
-def test_joints_lie_in_the_middle_of_the_body() -> None:
-    surface = Surface.of(MOUSE)
-    trunk = surface.vertices(on_floor(1))[0, : surface.n_trunk_vertices]
-    joints = on_floor(1).joints(MOUSE)[0]
-    for joint in joints[:-1]:
+    for joint in on_floor(1, scale=65.0 / MOUSE.length).joints(MOUSE)[0, :-1]:  # in the middle
         near = trunk[np.abs(trunk[:, 0] - joint[0]) < 4.0]
         np.testing.assert_allclose(near[:, 1:].min(0) + near[:, 1:].max(0), 2 * joint[1:], atol=0.5)
 
 
-def test_the_trunk_moves_rigidly_with_its_root() -> None:
+def test_the_trunk_moves_rigidly_with_its_root_and_scales_with_the_animal() -> None:
     rng = np.random.default_rng(0)
     surface = Surface.of(MOUSE)
     angles = rng.uniform(-0.5, 0.5, (5, 3)) * MOUSE.axes
     angles[0] = 0
     pose, T = Pose(SE3.identity(), angles, np.array(1.0)), SE3.exp(rng.uniform(-2, 2, 6))
-    np.testing.assert_allclose(
-        surface.vertices(pose.moved(T)), T @ surface.vertices(pose), atol=1e-9
-    )
-
-
-def test_the_mesh_scales_with_the_animal() -> None:
-    surface = Surface.of(MOUSE)
+    moved = surface.vertices(pose.moved(T))
+    np.testing.assert_allclose(moved, T @ surface.vertices(pose), atol=1e-9)
     one, two = on_floor(1, 1.0, 0.0), on_floor(1, 2.0, 0.0)
     np.testing.assert_allclose(surface.vertices(two), 2.0 * surface.vertices(one), atol=1e-9)
 
@@ -121,11 +102,6 @@ def test_shapes_are_bodies_and_follow_the_seed(family: str) -> None:
     )  # these two leave the range of mice
 
 
-def slim(shape: BodyShape) -> np.ndarray:
-    """Half widths of the bodies that are narrower than the default animal."""
-    return shape.half_width[shape.half_width.max(axis=1) < max(MOUSE.surface["half_width_mm"])]
-
-
 def test_the_other_familys_profiles_are_not_the_training_familys() -> None:
     rng = np.random.default_rng(6)
     train, other = (
@@ -137,18 +113,13 @@ def test_the_other_familys_profiles_are_not_the_training_familys() -> None:
     ]
     mean = relative[0].mean(axis=0)
     _, _, axes = np.linalg.svd(relative[0] - mean, full_matrices=False)
-    rest = [
-        np.linalg.norm((r - mean) - (r - mean) @ axes[:4].T @ axes[:4], axis=1).mean()
-        for r in relative
-    ]
-    assert rest[1] > 2.0 * rest[0]
-
-
-def test_slim_bodies_of_the_other_family_are_widest_further_forward() -> None:
-    rng = np.random.default_rng(6)
-    train = STATIONS[draw_shapes(rng, MOUSE, "train", 2000).half_width.argmax(axis=1)].mean()
-    other = STATIONS[slim(draw_shapes(rng, MOUSE, "other", 2000)).argmax(axis=1)].mean()
-    assert other > train + 0.08
+    unexplained = np.eye(len(mean)) - axes[:4].T @ axes[:4]
+    usual, unusual = (np.linalg.norm((r - mean) @ unexplained, axis=1).mean() for r in relative)
+    assert unusual > 2.0 * usual
+    # and slim bodies are widest further forward
+    slim = other[other.max(axis=1) < max(MOUSE.surface["half_width_mm"])]
+    widest = [STATIONS[width.argmax(axis=1)].mean() for width in (train, slim)]
+    assert widest[1] > widest[0] + 0.08
 
 
 def test_the_tail_lies_on_the_floor_behind_the_animal() -> None:
@@ -162,6 +133,9 @@ def test_the_tail_lies_on_the_floor_behind_the_animal() -> None:
     assert (tail[:, -1, 0] < vertices[:, 0, 0]).all()
 
 
-def test_an_unknown_family_is_refused() -> None:
-    with pytest.raises(LiexError, match="choose one of train, augmented, wide, other"):
-        draw_shapes(np.random.default_rng(0), MOUSE, "rats", 1)
+@pytest.mark.parametrize(
+    ("draw", "animal"), [(draw_shapes, "mouse"), (vary_body, "fish"), (draw_hands, "hand")]
+)
+def test_an_unknown_family_is_refused(draw, animal) -> None:
+    with pytest.raises(LiexError, match="'rats'; choose one of train, augmented, wide, other"):
+        draw(np.random.default_rng(0), Skeleton.load(animal), "rats", 1)

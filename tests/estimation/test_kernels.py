@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from liex_lab.body.kinematics import KinematicTree, forward_kinematics
+from liex_lab.body.pose import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.forests._kernels import VIEW

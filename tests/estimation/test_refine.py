@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from liex_lab.body.capsules import Spheres
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import Spheres
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
+from liex_lab.body.surface import Surface, render_mesh
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation._residual_kernels import place_balls
 from liex_lab.estimation.cascade import ImageSet
@@ -23,7 +23,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import HandSegmenter, sight_rotations
 from liex_lab.scene.height_maps import HeightMaps, view_of
-from liex_lab.simulation.hand.pose_prior import draw_seen
+from liex_lab.simulation.hand.pose_prior import draw_observed
 from tests.oracles.explain import explained
 
 HAND = Skeleton.load("hand")
@@ -37,11 +37,13 @@ SCENE = HandSegmenter(CAMERA, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 900.0,
 def hands(n: int = 24, seed: int = 0) -> tuple[HeightMaps, np.ndarray, Pose]:
     """Height maps of bare hands, how they were cut, and their poses in the view frames."""
     rng = np.random.default_rng(seed)
-    angles, turns = draw_seen(rng, HAND, n)
+    angles, turns = draw_observed(rng, HAND, n)
     place = np.column_stack([rng.uniform(-40, 40, (n, 2)), rng.uniform(600, 700, n)])
     pose = Pose(SE3(np.swapaxes(sight_rotations(place), 1, 2) @ turns, place), angles, np.ones(n))
     surface = Surface.of(HAND)
-    depths = np.stack([surface.render(pose[k], CAMERA) for k in range(n)])
+    depths = np.stack(
+        [render_mesh(surface.vertices(pose[k]), surface.faces, CAMERA) for k in range(n)]
+    )
     crops = SCENE.extract(depths, 1.0)
     crop_cameras = SCENE.crop_cameras(crops)
     return crops, crop_cameras, pose.moved(view_of(crop_cameras))

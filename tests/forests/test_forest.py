@@ -13,7 +13,7 @@ from numba import njit
 
 from liex_lab.forests import _kernels as kernels
 from liex_lab.forests._walk import LANES, walk_one_view, walk_views
-from liex_lab.forests.forest import Samples, predict
+from liex_lab.forests.forest import Forest, Samples, predict
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from tests.oracles.forest import leaf_by_hand
 
@@ -47,6 +47,13 @@ def bumps() -> tuple[Samples, np.ndarray]:
     return Samples(heights, image, inverse_size, views, scalars), where.astype(np.float32)
 
 
+def grown(bumps, **changes) -> tuple[Forest, np.ndarray]:
+    """A forest of the bumps, and which image each tree was grown on."""
+    samples, labels = bumps
+    keep = np.ones(len(samples), bool)
+    return grow_forest(samples, labels, keep, replace(PLAN, **changes), np.random.default_rng(0))
+
+
 def test_a_node_holds_offsets_and_threshold_of_any_sign():
     for u, v, threshold in (
         ((-127, 5, 0), (127, -1, -128 + 1), -32768),
@@ -59,10 +66,8 @@ def test_a_node_holds_offsets_and_threshold_of_any_sign():
 
 
 def test_descents_agree_with_the_walk_a_reader_would_write(bumps):
-    samples, labels = bumps
-    forest, _ = grow_forest(
-        samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0)
-    )
+    samples, _ = bumps
+    forest, _ = grown(bumps)
     for s in range(0, 400, 7):
         for root in forest.roots:
             scene = (
@@ -141,19 +146,14 @@ def test_sixteen_lanes_reach_the_leaves_that_one_sample_after_the_other_does(bum
 
 def test_a_forest_learns_where_the_bump_is(bumps):
     samples, labels = bumps
-    forest, in_bag = grow_forest(
-        samples, labels, np.ones(len(samples), bool), PLAN, np.random.default_rng(0)
-    )
+    forest, in_bag = grown(bumps)
     off = np.linalg.norm(predict(forest, samples, in_bag) - labels, axis=1).mean()
     assert off < 0.5 * np.linalg.norm(labels - labels.mean(0), axis=1).mean()
 
 
 def test_out_of_bag_predictions_use_only_trees_that_did_not_see_the_image(bumps):
-    samples, labels = bumps
-    plan = replace(PLAN, n_trees=1)
-    forest, in_bag = grow_forest(
-        samples, labels, np.ones(len(samples), bool), plan, np.random.default_rng(0)
-    )
+    samples, _ = bumps
+    forest, in_bag = grown(bumps, n_trees=1)
     assert in_bag.sum() == round(0.63 * len(samples))
     two = np.concatenate([in_bag, ~in_bag])
     doubled = replace(forest, roots=np.repeat(forest.roots, 2))
@@ -161,26 +161,18 @@ def test_out_of_bag_predictions_use_only_trees_that_did_not_see_the_image(bumps)
 
 
 def test_growth_does_not_depend_on_the_number_of_threads(bumps):
-    samples, labels = bumps
-    everything = np.ones(len(samples), bool)
-    grown = []
+    forests = []
     for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
         numba.set_num_threads(threads)
-        grown.append(grow_forest(samples, labels, everything, PLAN, np.random.default_rng(5))[0])
+        forests.append(grown(bumps)[0])
     numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    np.testing.assert_array_equal(grown[0].nodes, grown[1].nodes)
-    np.testing.assert_array_equal(grown[0].leaves, grown[1].leaves)
+    np.testing.assert_array_equal(forests[0].nodes, forests[1].nodes)
+    np.testing.assert_array_equal(forests[0].leaves, forests[1].leaves)
 
 
 def test_no_leaf_is_smaller_than_allowed(bumps):
-    samples, labels = bumps
-    forest, _ = grow_forest(
-        samples,
-        labels,
-        np.ones(len(samples), bool),
-        replace(PLAN, bag_share=1.0),
-        np.random.default_rng(1),
-    )
+    samples, _ = bumps
+    forest, _ = grown(bumps, bag_share=1.0)
     for root in forest.roots:
         reached = [
             kernels.descend(

@@ -21,13 +21,13 @@ def test_log_undoes_exp(omega: Array) -> None:
 
 
 @given(direction=directions())
-@pytest.mark.parametrize("below_pi", [0.0, 1e-15, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3])
-def test_log_undoes_exp_up_to_pi(below_pi: float, direction: Array) -> None:
-    omega = (np.pi - below_pi) * direction
-    back = so3.log(so3.exp(omega))
-    sign = np.sign(back @ omega) if below_pi < 1e-9 else 1.0
-    np.testing.assert_allclose(sign * back, omega, atol=1e-9, rtol=0)
-    assert np.linalg.norm(back) <= np.pi + 1e-15
+def test_log_undoes_exp_up_to_pi(direction: Array) -> None:
+    for below_pi in (0.0, 1e-15, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3):
+        omega = (np.pi - below_pi) * direction
+        back = so3.log(so3.exp(omega))
+        sign = np.sign(back @ omega) if below_pi < 1e-9 else 1.0
+        np.testing.assert_allclose(sign * back, omega, atol=1e-9, rtol=0)
+        assert np.linalg.norm(back) <= np.pi + 1e-15
 
 
 @given(direction=directions())
@@ -39,21 +39,16 @@ def test_log_of_a_half_turn_written_down_exactly(direction: Array) -> None:
 
 
 @given(omega=rotation_vectors())
-def test_exp_agrees_with_the_matrix_exponential(omega: Array) -> None:
-    np.testing.assert_allclose(so3.exp(omega), motion.exp([*omega, 0, 0, 0])[:3, :3], atol=1e-12)
-
-
-@given(omega=rotation_vectors())
-def test_exp_is_a_proper_rotation(omega: Array) -> None:
+def test_exp_is_the_matrix_exponential_and_a_proper_rotation(omega: Array) -> None:
     rotation = so3.exp(omega)
+    np.testing.assert_allclose(rotation, motion.exp([*omega, 0, 0, 0])[:3, :3], atol=1e-12)
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
     assert abs(np.linalg.det(rotation) - 1.0) < 1e-13
 
 
 @given(omega=rotation_vectors(), x=directions())
-def test_hat_is_the_cross_product_and_vee_undoes_it(omega: Array, x: Array) -> None:
+def test_hat_is_the_cross_product(omega: Array, x: Array) -> None:
     np.testing.assert_allclose(so3.hat(omega) @ x, np.cross(omega, x), atol=1e-15)
-    np.testing.assert_array_equal(so3.vee(so3.hat(omega)), omega)
 
 
 @given(a=rotation_vectors(), b=rotation_vectors())
@@ -71,7 +66,6 @@ def test_the_inverse_of_the_left_jacobian_is_its_inverse(omega: Array) -> None:
 
 @pytest.mark.parametrize("function", [so3.exp, so3.left_jacobian, so3.left_jacobian_inverse])
 def test_series_and_formula_meet_where_they_part(function: object) -> None:
-    assert callable(function)
     for limit in (1e-4, 1e-3):
         below, above = (
             function([0.0, 0.0, limit * (1 - 1e-9)]),
@@ -107,10 +101,7 @@ def test_a_dented_rotation_is_mended(omega: Array) -> None:
     np.testing.assert_allclose(mended @ mended.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(mended) > 0
     assert motion.angle_between(mended, rotation) < 2e-5
-
-
-def test_a_reflection_becomes_a_rotation() -> None:
-    assert np.linalg.det(so3.nearest_rotation(np.diag([1.0, 1.0, -1.0]))) > 0
+    assert np.linalg.det(so3.nearest_rotation(np.diag([1.0, 1.0, -1.0]))) > 0  # a reflection
 
 
 @given(omega=rotation_vectors())

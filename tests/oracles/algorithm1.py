@@ -14,7 +14,7 @@ from math import erf
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.capsules import Spheres
+from liex_lab.body.shape import Spheres
 from liex_lab.estimation.model import Model
 from liex_lab.forests.forest import Forest
 from tests.oracles import motion

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from liex_lab.body.capsules import Spheres
+from liex_lab.body.shape import Spheres
 
 STRIDE = 6  # every so many crop pixels a reading is looked at
 

@@ -25,7 +25,7 @@ from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.simulation.scenes.catalogue import film
-from liex_lab.simulation.scenes.recording import TrueScene
+from liex_lab.simulation.scenes.stage import TrueScene
 from tests.pipelines.conftest import measure
 from tests.pipelines.test_shards import InTurn
 

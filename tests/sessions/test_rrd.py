@@ -15,6 +15,7 @@ import liex_lab.sessions.rrd as replay
 import liex_lab.sessions.rrd_scene as depth_of
 import liex_lab.sessions.rrd_scene as scene_of
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Surface
 from liex_lab.geometry import SE3, so3
 from liex_lab.recordings.timestamps import find_gaps, median_step
@@ -217,13 +218,13 @@ def test_the_body_is_that_of_the_shape_the_session_kept_or_of_its_girth(tmp_path
     }
     left = {"kept": False, "n_frames": 12, "why": "12 frames are too few"}
     usual = Surface.of(MOUSE.skeleton)
-    assert usual.shape is not None
+    assert isinstance(usual.body, BodyShape)
     own = replace(
         usual,
-        shape=replace(
-            usual.shape,
-            half_width=1.3 * usual.shape.half_width,
-            half_height=0.7 * usual.shape.half_height,
+        body=replace(
+            usual.body,
+            half_width=1.3 * usual.body.half_width,
+            half_height=0.7 * usual.body.half_height,
         ),
     )
     for name, animal, parts in (

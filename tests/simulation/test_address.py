@@ -10,8 +10,9 @@ import pytest
 from liex_lab.catalog import find_sample
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE_QVGA, RAYTRIX_R5, Lens
 from liex_lab.recordings import open_recording
-from liex_lab.simulation.locomotion import swimming_session, walking_session
+from liex_lab.simulation.locomotion import moving_session, walking_session
 from liex_lab.simulation.recording import SyntheticSession
+from liex_lab.simulation.species import FishSpecies
 from tests.recordings.asking import refusal
 
 ADDRESS = "synthetic:walk?seed=3&frames=6&sensor=primesense-qvga&spine_mm=70"
@@ -76,7 +77,7 @@ def test_a_fish_swims_before_a_light_field_camera_at_50_frames_a_second() -> Non
     assert fish.rate_hz == pytest.approx(50.0)
     assert (fish.spine_mm, fish.skeleton.name) == (28.0, "fish")
     np.testing.assert_array_equal(
-        fish.frame(1).depth, swimming_session(2, 3, spine_mm=28.0).frame(1).depth
+        fish.frame(1).depth, moving_session(FishSpecies(), 2, 3, spine_mm=28.0).frame(1).depth
     )
 
 

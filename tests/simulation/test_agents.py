@@ -10,8 +10,7 @@ import pytest
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
 from liex_lab.simulation.agents.agent import SPEED, STEP_S, Individual
-from liex_lab.simulation.fish import FishSpecies
-from liex_lab.simulation.species import MouseSpecies
+from liex_lab.simulation.species import FishSpecies, MouseSpecies
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def mouse() -> mouse_acts.MouseActor:
     )
 
 
-def measured(fish: fish_acts.FishActor, word: str, n: int = 25) -> dict[str, np.ndarray]:
+def measured(fish: fish_acts.FishActor, word: str, n: int = 15) -> dict[str, np.ndarray]:
     """Of n actions: length s, mean speed and climb in lengths (a second), net turn and largest bend
     in degrees.
     """
@@ -71,8 +70,8 @@ def test_an_uncut_recording_stays_in_the_water_holds_every_action_and_nameless_s
     words, counts = np.unique(motion.word, return_counts=True)
     assert set(words) == {"", *fish_acts.ACTIONS}
     assert 0.15 < counts[list(words).index("")] / len(motion.word) < 0.6
-    again = fish.uncut(np.random.default_rng(1), 240.0)
-    np.testing.assert_array_equal(again.position, motion.position)
+    again = fish.uncut(np.random.default_rng(1), 30.0).position
+    np.testing.assert_array_equal(again, motion.position[: len(again)])
 
 
 def test_a_mouse_turns_to_its_own_side_rears_at_walls_and_stays_in_its_box(mouse) -> None:

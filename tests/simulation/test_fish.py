@@ -1,6 +1,4 @@
-"""The fish: what real ones do it can do, too; it hangs anywhere in the water; its camera errs as a
-light field does.
-"""
+"""The fish: what real ones do it can do, too, and it hangs anywhere in the water."""
 
 from __future__ import annotations
 
@@ -12,12 +10,10 @@ import pytest
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.optics.camera import RAYTRIX_R5
-from liex_lab.simulation import _sensor_kernels as k
-from liex_lab.simulation import training_patches
-from liex_lab.simulation.fish import KINDS, FishSpecies, draw_bends
-from liex_lab.simulation.locomotion import swimming_session
+from liex_lab.simulation.locomotion import moving_session
+from liex_lab.simulation.pose_prior import FISH_KINDS, draw_bends
 from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.species import RAYTRIX_R5_SENSOR
+from liex_lab.simulation.species import FishSpecies
 from liex_lab.simulation.training_patches import TrainingPatches, training_blocks
 
 FISH = Skeleton.load("fish")
@@ -25,10 +21,8 @@ FISH = Skeleton.load("fish")
 
 @pytest.fixture(scope="module")
 def pictures() -> TrainingPatches:
-    """Sixteen training windows of fish."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training_patches, "BLOCK", 16)
-        return next(training_blocks(3, 1, FishSpecies(), window_px=272))
+    """Training windows of fish."""
+    return next(training_blocks(3, 1, FishSpecies(), window_px=272))[:16]
 
 
 def real_bends(reference_data: Path) -> np.ndarray:
@@ -45,7 +39,7 @@ def real_bends(reference_data: Path) -> np.ndarray:
 
 def test_every_real_posture_is_near_one_that_is_drawn(reference_data):
     rng = np.random.default_rng(0)
-    drawn = draw_bends(rng, FISH, rng.integers(len(KINDS), size=20_000))[:, 1:20]
+    drawn = draw_bends(rng, FISH, rng.integers(len(FISH_KINDS), size=20_000))[:, 1:20]
     for real in real_bends(reference_data):
         off = np.sqrt(np.mean((drawn - real) ** 2, axis=1)).min()
         assert (
@@ -64,7 +58,7 @@ def test_fish_bend_as_far_as_swimming_larvae_do(reference_data):
     )
     rng = np.random.default_rng(1)
     total = np.abs(
-        np.degrees(draw_bends(rng, FISH, rng.integers(len(KINDS), size=4000)).sum(axis=1))
+        np.degrees(draw_bends(rng, FISH, rng.integers(len(FISH_KINDS), size=4000)).sum(axis=1))
     )
     assert np.quantile(total, 0.95) > np.quantile(head_to_tail, 0.95)
     assert np.quantile(total, 0.4) < np.quantile(head_to_tail, 0.75)  # and most are not turning
@@ -73,7 +67,7 @@ def test_fish_bend_as_far_as_swimming_larvae_do(reference_data):
 
 def test_bends_stay_within_the_joints_limits_and_the_hind_half_does_most_of_them():
     rng = np.random.default_rng(2)
-    bends = draw_bends(rng, FISH, rng.integers(len(KINDS), size=3000))
+    bends = draw_bends(rng, FISH, rng.integers(len(FISH_KINDS), size=3000))
     assert (bends >= FISH.limits[:, 2, 0]).all()
     assert (bends <= FISH.limits[:, 2, 1]).all()
     assert (bends[:, [0, 20]] == 0).all()
@@ -107,14 +101,14 @@ def test_fish_hang_between_the_floor_and_the_nearest_that_the_camera_sees_whole(
     z = Surface.of(FISH).vertices(pose, shape, girth)[..., 2]
     assert z.min() > 0.0
     assert (camera_mm - z.max(axis=1)).min() > 140.0
-    assert set(kind) == set(range(len(KINDS)))
+    assert set(kind) == set(range(len(FISH_KINDS)))
     height = z.mean(axis=1) / camera_mm
     assert np.quantile(height, 0.05) < 0.06
     assert np.quantile(height, 0.95) > 0.28
 
 
 def test_a_swimming_fish_goes_head_first_and_stays_in_the_picture():
-    fish = swimming_session(6, 400)
+    fish = moving_session(FishSpecies(), 6, 400)
     uv = fish.camera.project(fish.joints_camera)
     assert ((uv > 0) & (uv < 1023)).all()
     middle = fish.joints_arena.mean(axis=1)
@@ -132,60 +126,5 @@ def test_a_swimming_fish_goes_head_first_and_stays_in_the_picture():
 def test_the_same_seed_gives_the_same_fish():
     first, again = (SyntheticSession.draw([7, 1], 2, species=FishSpecies()) for _ in range(2))
     np.testing.assert_array_equal(first.depths(0, 2), again.depths(0, 2))
-    assert first.camera == RAYTRIX_R5
+    assert (first.camera, first.rate_hz) == (RAYTRIX_R5, 50.0)
     assert 25.0 <= first.spine_mm <= 40.0
-    assert np.diff(first.times_ns).tolist() == [20_000_000]
-
-
-# the light-field camera
-
-
-def sensed(distance_mm: float, **changes: float) -> np.ndarray:
-    """A flat animal at a distance, as one unit of the camera sees it, mm (0 unread)."""
-    p = RAYTRIX_R5_SENSOR.draw(np.random.default_rng(0), 1, np.zeros(1))[0]
-    columns = {
-        "noise": k.NOISE,
-        "dark": k.DARK,
-        "filled": k.FLYING,
-        "outliers": k.OUTLIERS,
-        "smooth": k.SMOOTH,
-    }
-    p[[k.LUMPS, k.OUTLIERS, k.DARK]] = 0.0, 99.0, -99.0
-    for name, value in changes.items():
-        p[columns[name]] = value
-    shape = (240, 240)
-    depth, what = np.full(shape, distance_mm, np.float32), np.full(shape, k.ANIMAL, np.uint8)
-    out = np.zeros(shape, np.uint16)
-    k.sense(
-        depth,
-        what,
-        p,
-        2363.0,
-        0.0,
-        0.0,
-        np.array([99], np.uint64),
-        k.NORMAL,
-        np.empty(shape, np.float32),
-        out,
-    )
-    return out * p[k.UNIT]
-
-
-def test_range_noise_grows_with_the_square_of_the_distance_and_is_mostly_smooth():
-    near, far = sensed(200.0, smooth=1.0), sensed(400.0, smooth=1.0)
-    assert near.mean() == pytest.approx(200.0, abs=0.3)
-    assert far.std() / near.std() == pytest.approx(4.0, rel=0.1)
-    assert np.diff(near, axis=1).std() < 0.8 * near.std()
-    assert sensed(200.0, smooth=1.0, noise=2.0).std() / near.std() == pytest.approx(2.0, rel=0.1)
-
-
-def test_skin_without_texture_is_unread_or_filled():
-    bare, filled = sensed(250.0, dark=-0.5, filled=0.0), sensed(250.0, dark=-0.5, filled=1.0)
-    assert 0.1 < (bare == 0).mean() < 0.5
-    assert (filled == 0).mean() == 0.0
-    assert filled.std() > bare[bare > 0].std()
-
-
-def test_some_patches_are_matched_wrongly():
-    wrong = np.abs(sensed(250.0, outliers=2.4) - 250.0)
-    assert 0.0005 < (wrong > 8.0).mean() < 0.05

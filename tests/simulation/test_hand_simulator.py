@@ -11,18 +11,13 @@ import pytest
 from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON, NyuReference
-from liex_lab.simulation.hand import pose_prior, simulator
+from liex_lab.simulation.hand import pose_prior
 from liex_lab.simulation.hand.pose_prior import find_reference
-from liex_lab.simulation.hand.simulator import HandSimulator, gesture_session
+from liex_lab.simulation.hand.simulator import HandSimulator
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.training_patches import TrainingPatches
 
 HAND = Skeleton.load("hand")
-
-
-@pytest.fixture(autouse=True)
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(simulator, "BLOCK", 32)
 
 
 @cache
@@ -32,10 +27,8 @@ def block() -> TrainingPatches:
 
 
 def test_the_world_of_a_hand_is_its_own() -> None:
-    world = world_of(HAND)
-    assert isinstance(world, HandSimulator)
-    assert world.splits == ("clean", "hard", "other-body", "other-camera")
-    assert "NYU" in world.sources
+    assert isinstance(world_of(HAND), HandSimulator)
+    assert "NYU" in world_of(HAND).sources
 
 
 def test_blocks_are_the_same_bits_on_one_core_and_on_two_and_in_any_order() -> None:
@@ -83,10 +76,9 @@ def test_splits_are_fixed_and_their_people_differ() -> None:
     np.testing.assert_array_equal(clean[1].joints_camera, again[1].joints_camera)
     np.testing.assert_array_equal(clean[0].depths(3, 5), again[0].depths(3, 5))
     assert clean[0].spine_mm != clean[1].spine_mm
-    assert world.test_split("hard", n_sessions=1)[0].contents.shown.any()
-    assert world.test_split("clean", spine_mm=150.0, n_sessions=1)[0].spine_mm == pytest.approx(
-        150.0
-    )
+    (hard,) = world.test_split("hard", spine_mm=150.0, n_sessions=1)
+    assert hard.contents.shown.any()
+    assert hard.spine_mm == pytest.approx(150.0)
     with pytest.raises(LiexError, match="known are clean, hard, other-body"):
         world.test_split("soft")
 
@@ -116,14 +108,12 @@ def test_the_labels_are_looked_for_in_one_place_whatever_folder_a_command_runs_i
     beside = tmp_path / "shared" / "data" / "hand_nyu"
     beside.mkdir(parents=True)
     (beside / "nyu_test_14joints.npz").touch()
-    (tmp_path / "work").mkdir()
-    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
     monkeypatch.delenv("LIEX_NYU", raising=False)
-    monkeypatch.chdir(tmp_path / "work")
-    assert find_reference() is None  # what lies beside the current folder does not count
-    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "repository")
-    assert find_reference() == beside
-    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "elsewhere" / "repository")
+    monkeypatch.chdir(tmp_path)  # what lies in the current folder does not count
+    for repository, found in ((tmp_path / "far" / "code", None), (tmp_path / "code", beside)):
+        monkeypatch.setattr(pose_prior, "_REPOSITORY", repository)
+        assert find_reference() == found
+    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "far" / "code")
     monkeypatch.setenv("LIEX_NYU", str(beside))
     assert find_reference() == beside
     monkeypatch.setenv("LIEX_NYU", str(tmp_path))
@@ -132,7 +122,7 @@ def test_the_labels_are_looked_for_in_one_place_whatever_folder_a_command_runs_i
 
 
 def test_gestures_flow() -> None:
-    session = gesture_session(HAND, 3, 60)
+    session = HandSimulator(HAND).motion(3, 60)
     step = np.linalg.norm(np.diff(session.joints_camera, axis=0), axis=-1)
     assert step.max() < 60.0  # mm a frame at 30 frames/s: quick, but no jump
     assert (

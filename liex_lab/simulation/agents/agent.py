@@ -9,7 +9,7 @@ log-uniform traits (`Individual`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter, lfilter_zi
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.surface import Body, Surface
+from liex_lab.body.shape import Body
+from liex_lab.body.surface import Surface
 from liex_lab.geometry import SE3
 from liex_lab.scene.height_maps import Patches
 from liex_lab.simulation import _render_kernels as render_kernels
-from liex_lab.simulation._sensor_kernels import NORMAL, UNIT
-from liex_lab.simulation.scene import PART_FACES, draw_views, rounded
+from liex_lab.simulation._sensor_kernels import ANIMAL, NORMAL, OBJECT, UNIT
+from liex_lab.simulation.scene import PART_FACES, draw_views
 from liex_lab.simulation.species import Sensor, Species
 from liex_lab.simulation.training_patches import inverse_depth_plane, window_origin
 
@@ -99,7 +100,7 @@ class Individual:
 
 
 @dataclass(frozen=True)
-class Motion:
+class ActedMotion:
     """A behaviour sequence at the steps of the 5 ms clock.
 
     Attributes:
@@ -115,23 +116,6 @@ class Motion:
     position: Array
     word: NDArray[np.str_]
     act: NDArray[np.int64]
-
-    def __getitem__(self, rows: NDArray[np.int64]) -> Motion:
-        """A subset of steps.
-
-        Args:
-            rows: (n,) int64 numbers of steps.
-
-        Returns:
-            The motion at these steps.
-        """
-        return Motion(
-            self.channels[rows],
-            self.heading[rows],
-            self.position[rows],
-            self.word[rows],
-            self.act[rows],
-        )
 
     def at(self, rate_hz: float) -> NDArray[np.int64]:
         """Steps at which a camera takes frames.
@@ -181,7 +165,7 @@ class BehaviourSequence:
         self.position = np.array(position, float)
         self.heading = heading
         self._fits = fits
-        self._told: list[tuple[Array, Array, Array, str]] = []
+        self._actions: list[tuple[Array, Array, Array, str]] = []
         self.n_steps = 0
 
     def play(self, word: str, draw: Callable[[], Array], tries: int = _TRIES) -> bool:
@@ -209,7 +193,7 @@ class BehaviourSequence:
                 self._state = state
                 self.position = position[-1]
                 self.heading = float(heading[-1])
-                self._told.append((channels, heading, position, word))
+                self._actions.append((channels, heading, position, word))
                 self.n_steps += len(wanted)
                 return True
         return False
@@ -223,7 +207,7 @@ class BehaviourSequence:
         self.position = np.array(position, float)
         self._state[:, SPEED] = 0.0
 
-    def told(self) -> Motion:
+    def motion(self) -> ActedMotion:
         """The motion of the sequence so far.
 
         A label begins when the action becomes visible in the body, which lags by 2 time constants
@@ -232,15 +216,15 @@ class BehaviourSequence:
         Returns:
             The motion on the 5 ms clock.
         """
-        lengths = [len(heading) for _, heading, _, _ in self._told]
-        word = np.repeat([word for *_, word in self._told], lengths)
+        lengths = [len(heading) for _, heading, _, _ in self._actions]
+        word = np.repeat([word for *_, word in self._actions], lengths)
         act = np.repeat(np.arange(len(lengths)), lengths)
         lag = min(self._lag, lengths[0] if lengths else 0)
         late = np.maximum(np.arange(len(word)) - lag, 0)
         channels, heading, position = (
-            np.concatenate([part[k] for part in self._told]) for k in range(3)
+            np.concatenate([part[k] for part in self._actions]) for k in range(3)
         )
-        return Motion(channels, heading, position, word[late], act[late])
+        return ActedMotion(channels, heading, position, word[late], act[late])
 
 
 def clock(seconds: float) -> Array:
@@ -253,6 +237,12 @@ def clock(seconds: float) -> Array:
         (m,) s, from 0 in steps of `STEP_S`.
     """
     return np.asarray(np.arange(max(2, round(seconds / STEP_S))) * STEP_S)
+
+
+def own_shares(rng: np.random.Generator, shares: Mapping[str, float]) -> tuple[list[str], Array]:
+    """The actions of one animal and their probabilities, which vary around given frequencies."""
+    share = np.array(list(shares.values())) * np.exp(rng.normal(0.0, 0.25, len(shares)))
+    return list(shares), share / share.sum()
 
 
 def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:
@@ -305,7 +295,7 @@ class CameraPath:
 
     Attributes:
         intrinsics: (4,) fx, fy, cx, cy of the rendered images, px.
-        picture: (2,) their width and height, px.
+        size_px: (2,) their width and height, px.
         T_arena_camera: its pose.
         parameters: (N_PARAMETERS,) of the unit's sensor.
         floor_error: (3,) error of the estimated floor: slopes along x and y, rad, and mm farther
@@ -313,7 +303,7 @@ class CameraPath:
     """
 
     intrinsics: Array
-    picture: NDArray[np.int64]
+    size_px: NDArray[np.int64]
     T_arena_camera: SE3
     parameters: Array
     floor_error: Array
@@ -345,15 +335,16 @@ class CameraPath:
         """
         camera = sensor.camera.every(stride)
         focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
-        T = draw_views(rng, 1, species.setting)
-        place = SE3(T.rotation[0], np.array([0.0, 0.0, height_mm]))
+        place = replace(
+            draw_views(rng, 1, species.setting)[0], translation=np.array([0.0, 0.0, height_mm])
+        )
         parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))[0]
         margin = np.array([camera.width, camera.height]) / 2.0
-        picture = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
+        size_px = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
         error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * species.setting.scale]
         return CameraPath(
             np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]),
-            picture,
+            size_px,
             place,
             parameters,
             error,
@@ -394,21 +385,17 @@ def render_agent(
         m = part.stop - part.start
         lying = None if bends is None else np.repeat(bends, m, axis=0)
         vertices = surface.vertices(pose[part], shape[0].broadcast(m), girth[part], lying)
-        T = SE3(
-            np.tile(camera.T_arena_camera.rotation, (m, 1, 1)),
-            np.tile(camera.T_arena_camera.translation, (m, 1)),
-        )
+        T = camera.T_arena_camera[np.newaxis][np.zeros(m, np.int64)]
         intrinsics = np.tile(camera.intrinsics, (m, 1))
         trunk = vertices[:, : surface.n_trunk_vertices]
         origin = window_origin(trunk, T.inverse(), intrinsics, window_px)
         depth = np.empty((m, window_px, window_px), np.uint16)
         background = np.empty_like(depth)
-        nothing = rounded(np.zeros((m, 3)), np.ones((m, 3)), np.zeros(m), np.full(m, 2.0))
+        nothing = np.zeros((m, 3, 3))
         render_kernels.draw_windows(
-            render_kernels.Meshes(
-                vertices, surface.faces, nothing, PART_FACES, np.zeros(m, np.bool_)
-            ),
-            render_kernels.PatchCamera(intrinsics, np.tile(camera.picture, (m, 1)), origin),
+            render_kernels.part_of(vertices, surface.faces, ANIMAL),
+            render_kernels.part_of(nothing, PART_FACES[:0], OBJECT, np.zeros(m)),
+            render_kernels.PatchCamera(intrinsics, np.tile(camera.size_px, (m, 1)), origin),
             render_kernels.ArenaView(
                 T.rotation,
                 T.translation[:, 2].copy(),

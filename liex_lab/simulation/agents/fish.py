@@ -22,17 +22,17 @@ from liex_lab.simulation.agents.agent import (
     CLIMB,
     SPEED,
     STEP_S,
-    TURN,
     UNLABELLED,
+    ActedMotion,
     BehaviourSequence,
     Individual,
-    Motion,
     bump,
     clock,
+    own_shares,
     slow_noise,
 )
-from liex_lab.simulation.fish import FishSpecies, bend_profile, hung
-from liex_lab.simulation.pose_prior import root_rotation
+from liex_lab.simulation.pose_prior import bend_profile, hung, root_rotation
+from liex_lab.simulation.species import FishSpecies
 
 Array = NDArray[np.float64]
 
@@ -84,8 +84,8 @@ class FishActor:
             True if all m are.
         """
         low, high = self.water
-        seen = np.abs(position[:, :2]).max(axis=1) < self._half(position[:, 2])
-        return bool((seen & (position[:, 2] > low) & (position[:, 2] < high)).all())
+        visible = np.abs(position[:, :2]).max(axis=1) < self._half(position[:, 2])
+        return bool((visible & (position[:, 2] > low) & (position[:, 2] < high)).all())
 
     def _half(self, z: Array | float) -> Array | float:
         """Half the side of the view, mm, at a height."""
@@ -111,7 +111,7 @@ class FishActor:
             np.zeros(_CHANNELS), _BLEND_S, np.array(place), rng.uniform(-np.pi, np.pi), self.fits
         )
 
-    def cut(self, rng: np.random.Generator, word: str) -> Motion:
+    def cut(self, rng: np.random.Generator, word: str) -> ActedMotion:
         """One action between two quarter-second unnamed movements.
 
         Args:
@@ -129,10 +129,10 @@ class FishActor:
             before = sequence.play(UNLABELLED, lambda: self._between(rng, 0.25))
             done = before and sequence.play(word, lambda: self.act(rng, word))
             if done and sequence.play(UNLABELLED, lambda: self._between(rng, 0.25)):
-                return sequence.told()
+                return sequence.motion()
         raise AssertionError(f"no room for {word}")
 
-    def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
+    def uncut(self, rng: np.random.Generator, seconds: float) -> ActedMotion:
         """A recording: actions in random order, most of them separated by unnamed movements.
 
         Args:
@@ -143,17 +143,14 @@ class FishActor:
             The motion on the 5 ms clock.
         """
         sequence = self.begin(rng)
-        names = list(_SHARES)
-        share = np.array([_SHARES[name] for name in names]) * np.exp(
-            rng.normal(0.0, 0.25, len(names))
-        )
+        names, share = own_shares(rng, _SHARES)
         while sequence.n_steps * STEP_S < seconds:
-            word = str(rng.choice(names, p=share / share.sum()))
+            word = str(rng.choice(names, p=share))
             if sequence.play(word, partial(self.act, rng, word), 6) and rng.random() > _BETWEEN:
                 continue
             if not sequence.play(UNLABELLED, lambda: self._between(rng, None)):
                 self._go_home(rng, sequence)
-        return sequence.told()
+        return sequence.motion()
 
     def _go_home(self, rng: np.random.Generator, sequence: BehaviourSequence) -> None:
         """An unnamed slow turn towards the centre, or, if cornered, a turn without translation."""
@@ -163,12 +160,11 @@ class FishActor:
         level = 0.3 * np.clip(((low + high) / 2 - z) / (high - low), -1, 1)
 
         def home(pace: float) -> Array:
-            t, c = self._blank(rng, rng.uniform(1.2, 1.6))
-            c[:, TURN] = away / t[-1] * 2.0 * bump(t, t[-1])
-            c[:, _FRONT], c[:, _HIND] = 0.25 * c[:, TURN], 0.4 * c[:, TURN]
-            c[:, SPEED] = pace * self.length_mm
-            c[:, CLIMB] = level
-            return c
+            t, roll = self._begin(rng, rng.uniform(1.2, 1.6))
+            turn = away / t[-1] * 2.0 * bump(t, t[-1])
+            return self._channels(
+                t, roll, speed=pace, turn=turn, climb=level, front=0.25 * turn, hind=0.4 * turn
+            )
 
         if not sequence.play(UNLABELLED, lambda: home(0.5)):
             inside = np.clip(z, low + 2.0, high - 2.0)
@@ -176,12 +172,30 @@ class FishActor:
             sequence.nudge(np.array([*np.clip([x, y], -half, half), inside]))
             sequence.play(UNLABELLED, lambda: home(0.0))
 
-    def _blank(self, rng: np.random.Generator, seconds: float) -> tuple[Array, Array]:
-        """The clock and the channels of a resting fish."""
+    def _begin(self, rng: np.random.Generator, seconds: float) -> tuple[Array, Array]:
+        """The clock of an action and the roll of a fish, rad."""
         t = clock(seconds)
+        return t, np.radians(4.0) * slow_noise(rng, len(t), 1.5)[:, 0]
+
+    def _channels(
+        self,
+        t: Array,
+        roll: Array | float,
+        *,
+        speed: Array | float,
+        turn: Array | float = 0.0,
+        climb: Array | float = 0.0,
+        front: Array | float = 0.0,
+        hind: Array | float = 0.0,
+        wave: Array | float = 0.0,
+        beat: Array | float = 0.0,
+    ) -> Array:
+        """Control channels of one action; its speed is given in lengths per second."""
         c = np.zeros((len(t), _CHANNELS))
-        c[:, _ROLL] = np.radians(4.0) * slow_noise(rng, len(t), 1.5)[:, 0]
-        return t, c
+        for k, column in enumerate((speed, turn, climb, roll, front, hind, wave, beat)):
+            c[:, k] = column
+        c[:, SPEED] *= self.length_mm
+        return c
 
     def act(self, rng: np.random.Generator, word: str) -> Array:
         """Control channels of one action.
@@ -205,9 +219,7 @@ class FishActor:
             "thrash": self._thrash,
             "freeze": self._freeze,
         }
-        channels = table[word](rng)
-        channels[:, SPEED] *= self.length_mm
-        return channels
+        return table[word](rng)
 
     def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
         """Draw the duration of an action; most are near the shortest."""
@@ -219,200 +231,216 @@ class FishActor:
             )
         )
 
-    def _swim(self, rng: np.random.Generator, t: Array, c: Array, pace: float) -> None:
-        """Set the body wave for a speed."""
-        c[:, _WAVE] = self.fish.bend * rng.uniform(0.9, 2.1) * np.sqrt(max(pace, 0.05))
-        c[:, _BEAT] = self.fish.tempo * (2.5 + 1.1 * pace) * rng.uniform(0.85, 1.2)
+    def _wave(self, rng: np.random.Generator, pace: float) -> tuple[float, float]:
+        """Amplitude and rate of the body wave for a speed."""
+        wave = self.fish.bend * rng.uniform(0.9, 2.1) * np.sqrt(max(pace, 0.05))
+        return wave, self.fish.tempo * (2.5 + 1.1 * pace) * rng.uniform(0.85, 1.2)
 
     def _scoot(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.25, 1.6))
+        t, roll = self._begin(rng, self._seconds(rng, 0.25, 1.6))
         pace = self.fish.vigour * rng.uniform(0.7, 3.6)
-        self._swim(rng, t, c, pace)
+        wave, beat = self._wave(rng, pace)
         beating = t < rng.uniform(0.55, 1.0) * t[-1]
-        c[:, SPEED] = pace * np.where(beating, 1.0, np.exp(-(t - t[beating][-1]) / 0.35))
-        c[~beating, _WAVE] *= 0.15
         bend = rng.normal(0.0, 0.5)
-        c[:, TURN] = (
-            np.radians(rng.normal(0.0, 14.0))
-            + np.radians(10.0) * slow_noise(rng, len(t), 0.4)[:, 0]
+        return self._channels(
+            t,
+            roll,
+            speed=pace * np.where(beating, 1.0, np.exp(-(t - t[beating][-1]) / 0.35)),
+            wave=wave * np.where(beating, 1.0, 0.15),
+            beat=beat,
+            turn=np.radians(rng.normal(0.0, 14.0))
+            + np.radians(10.0) * slow_noise(rng, len(t), 0.4)[:, 0],
+            front=bend,
+            hind=1.5 * bend,
+            climb=np.radians(rng.normal(0.0, 5.0)),
         )
-        c[:, _FRONT] = bend
-        c[:, _HIND] = 1.5 * bend
-        c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
-        return c
 
     def _j_turn(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.3, 1.4))
+        t, roll = self._begin(rng, self._seconds(rng, 0.3, 1.4))
         side = self.fish.turn_side(rng)
         rate = self.fish.tempo * rng.uniform(2.2, 5.0)
         beats = 0.5 - 0.5 * np.cos(2 * np.pi * np.minimum(rate, 2.0 / t[-1] + rate) * t)
-        c[:, _HIND] = side * self.fish.bend * rng.uniform(1.9, 4.6) * (0.25 + 0.75 * beats)
-        c[:, _FRONT] = 0.12 * c[:, _HIND] + rng.normal(0.0, 0.2)
-        turn = np.radians(rng.uniform(8.0, 42.0))
-        c[:, TURN] = side * turn / t[-1] * (0.3 + 1.4 * beats)
-        c[:, SPEED] = self.fish.vigour * rng.uniform(0.1, 1.1)
-        c[:, _WAVE] = rng.uniform(0.1, 0.7)
-        c[:, _BEAT] = rate
-        c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
-        return c
+        hind = side * self.fish.bend * rng.uniform(1.9, 4.6) * (0.25 + 0.75 * beats)
+        return self._channels(
+            t,
+            roll,
+            hind=hind,
+            front=0.12 * hind + rng.normal(0.0, 0.2),
+            turn=side * np.radians(rng.uniform(8.0, 42.0)) / t[-1] * (0.3 + 1.4 * beats),
+            speed=self.fish.vigour * rng.uniform(0.1, 1.1),
+            wave=rng.uniform(0.1, 0.7),
+            beat=rate,
+            climb=np.radians(rng.normal(0.0, 5.0)),
+        )
 
     def _bent(
-        self,
-        rng: np.random.Generator,
-        t: Array,
-        c: Array,
-        shape: Array,
-        total_deg: float,
-        lag_s: float,
-    ) -> None:
-        """Add bends that sum to total_deg from head to tail at the shape's peak; the tail lags."""
+        self, rng: np.random.Generator, shape: Array, total_deg: float, lag_s: float
+    ) -> tuple[Array, Array]:
+        """Bends, in front and behind, that sum to total_deg at the shape's peak; the tail lags."""
         hind = rng.uniform(0.52, 0.64)
         lag = max(1, round(lag_s / STEP_S))
         late = np.concatenate([np.zeros(lag), shape])[: len(shape)]
-        c[:, _FRONT] += total_deg * (1.0 - hind) / 9.0 * shape
-        c[:, _HIND] += total_deg * hind / 10.0 * late
+        return total_deg * (1.0 - hind) / 9.0 * shape, total_deg * hind / 10.0 * late
 
     def _r_turn(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.25, 0.95))
+        t, roll = self._begin(rng, self._seconds(rng, 0.25, 0.95))
         side = self.fish.turn_side(rng)
         total = float(np.clip(self.fish.bend * rng.normal(72.0, 17.0), 44.0, 112.0))
         length = t[-1] * rng.uniform(0.75, 1.0)
         shape = bump(t, length, rng.uniform(0.3, 0.5))
-        self._bent(rng, t, c, side * shape, total, 0.02)
-        c[:, TURN] = (
-            side * np.radians(total * rng.uniform(0.5, 1.1)) * shape / (shape.sum() * STEP_S)
-        )
+        front, hind = self._bent(rng, side * shape, total, 0.02)
+        turn = side * np.radians(total * rng.uniform(0.5, 1.1)) * shape / (shape.sum() * STEP_S)
         pace = self.fish.vigour * rng.uniform(0.3, 2.8)
-        c[:, SPEED] = pace * (0.5 + 0.5 * t / t[-1])
-        self._swim(rng, t, c, 0.4 * pace)
-        c[:, CLIMB] = np.radians(rng.normal(0.0, 6.0))
-        return c
+        wave, beat = self._wave(rng, 0.4 * pace)
+        return self._channels(
+            t,
+            roll,
+            speed=pace * (0.5 + 0.5 * t / t[-1]),
+            turn=turn,
+            climb=np.radians(rng.normal(0.0, 6.0)),
+            front=front,
+            hind=hind,
+            wave=wave,
+            beat=beat,
+        )
 
     def _c_turn(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.16, 0.7))
+        t, roll = self._begin(rng, self._seconds(rng, 0.16, 0.7))
         side = self.fish.turn_side(rng)
         total = float(np.clip(self.fish.bend * rng.normal(132.0, 22.0), 88.0, 178.0))
         first = rng.uniform(0.05, 0.10)
         back = rng.uniform(0.06, 0.11)
         bend = bump(t, first + back, first / (first + back))
         counter = bump(t - first - 0.6 * back, 1.6 * back) * (t > first + 0.6 * back)
-        self._bent(rng, t, c, side * (bend - rng.uniform(0.15, 0.45) * counter), total, 0.012)
+        bends = side * (bend - rng.uniform(0.15, 0.45) * counter)
+        front, hind = self._bent(rng, bends, total, 0.012)
         shape = bump(t, 1.4 * first + 0.5 * back)
-        c[:, TURN] = (
-            side * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
-        )
+        turn = side * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
         pace = self.fish.vigour * rng.uniform(2.5, 9.0)
         glide = np.exp(-np.maximum(t - first - 0.1, 0.0) / rng.uniform(0.2, 0.5))
-        c[:, SPEED] = pace * np.where(t < first, 0.15, glide)
-        self._swim(rng, t, c, 0.5 * pace)
-        c[:, _WAVE] *= np.clip((t - first) / 0.08, 0.0, 1.0)
-        c[:, CLIMB] = np.radians(rng.normal(0.0, 9.0))
-        return c
+        wave, beat = self._wave(rng, 0.5 * pace)
+        return self._channels(
+            t,
+            roll,
+            speed=pace * np.where(t < first, 0.15, glide),
+            turn=turn,
+            climb=np.radians(rng.normal(0.0, 9.0)),
+            front=front,
+            hind=hind,
+            wave=wave * np.clip((t - first) / 0.08, 0.0, 1.0),
+            beat=beat,
+        )
 
     def _climb(self, rng: np.random.Generator, side: float) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.5, 2.6))
+        t, roll = self._begin(rng, self._seconds(rng, 0.5, 2.6))
         pace = self.fish.vigour * rng.uniform(0.6, 2.6)
-        c[:, CLIMB] = side * np.radians(rng.uniform(15.0, 45.0)) * np.minimum(1.0, (t + 0.1) / 0.3)
-        c[:, SPEED] = pace
-        self._swim(rng, t, c, pace)
-        c[:, TURN] = (
-            np.radians(rng.normal(0.0, 12.0)) + np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        climb = side * np.radians(rng.uniform(15.0, 45.0)) * np.minimum(1.0, (t + 0.1) / 0.3)
+        wave, beat = self._wave(rng, pace)
+        return self._channels(
+            t,
+            roll,
+            speed=pace,
+            turn=np.radians(rng.normal(0.0, 12.0))
+            + np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0],
+            climb=climb,
+            front=rng.normal(0.0, 0.4),
+            wave=wave,
+            beat=beat,
         )
-        c[:, _FRONT] = rng.normal(0.0, 0.4)
-        return c
 
     def _zigzag(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.8, 2.6))
+        t, roll = self._begin(rng, self._seconds(rng, 0.8, 2.6))
+        turn, front, hind = np.zeros((3, len(t)))
         at = 0.0
         side = self.fish.turn_side(rng)
         while at < t[-1]:
             length = rng.uniform(0.16, 0.36) / self.fish.tempo
             shape = bump(t - at, length, 0.4) * (t >= at)
-            turn = np.radians(rng.uniform(65.0, 140.0))
-            c[:, TURN] += side * turn * shape / max(shape.sum() * STEP_S, 0.5 * length)
-            self._bent(rng, t, c, side * shape, self.fish.bend * rng.uniform(40.0, 105.0), 0.02)
+            angle = np.radians(rng.uniform(65.0, 140.0))
+            turn += side * angle * shape / max(shape.sum() * STEP_S, 0.5 * length)
+            bends = self._bent(rng, side * shape, self.fish.bend * rng.uniform(40.0, 105.0), 0.02)
+            front += bends[0]
+            hind += bends[1]
             at = at + length * rng.uniform(0.8, 1.3)
             side = -side
         pace = self.fish.vigour * rng.uniform(1.2, 4.5)
-        c[:, SPEED] = pace * (0.8 + 0.25 * slow_noise(rng, len(t), 0.25)[:, 0])
-        self._swim(rng, t, c, 0.5 * pace)
-        c[:, CLIMB] = np.radians(7.0) * slow_noise(rng, len(t), 0.5)[:, 0]
-        return c
+        speed = pace * (0.8 + 0.25 * slow_noise(rng, len(t), 0.25)[:, 0])
+        wave, beat = self._wave(rng, 0.5 * pace)
+        return self._channels(
+            t,
+            roll,
+            speed=speed,
+            turn=turn,
+            climb=np.radians(7.0) * slow_noise(rng, len(t), 0.5)[:, 0],
+            front=front,
+            hind=hind,
+            wave=wave,
+            beat=beat,
+        )
 
     def _thrash(self, rng: np.random.Generator) -> Array:
-        t, c = self._blank(rng, self._seconds(rng, 0.4, 2.4))
+        t, roll = self._begin(rng, self._seconds(rng, 0.4, 2.4))
         beat = self.fish.tempo * rng.uniform(3.5, 7.5)
-        c[:, _WAVE] = self.fish.bend * rng.uniform(3.4, 7.5)
-        c[:, _BEAT] = beat
-        c[:, TURN] = rng.uniform(1.0, 5.0) * np.sin(
-            2 * np.pi * beat * t + rng.uniform(0, 6)
-        ) + rng.normal(0.0, 0.4)
-        c[:, SPEED] = self.fish.vigour * np.abs(
-            rng.uniform(0.0, 0.6) + 0.25 * slow_noise(rng, len(t), 0.3)[:, 0]
+        return self._channels(
+            t,
+            2.0 * roll,
+            wave=self.fish.bend * rng.uniform(3.4, 7.5),
+            beat=beat,
+            turn=rng.uniform(1.0, 5.0) * np.sin(2 * np.pi * beat * t + rng.uniform(0, 6))
+            + rng.normal(0.0, 0.4),
+            speed=self.fish.vigour
+            * np.abs(rng.uniform(0.0, 0.6) + 0.25 * slow_noise(rng, len(t), 0.3)[:, 0]),
+            climb=np.radians(rng.normal(0.0, 10.0)),
         )
-        c[:, CLIMB] = np.radians(rng.normal(0.0, 10.0))
-        c[:, _ROLL] *= 2.0
-        return c
 
     def _freeze(self, rng: np.random.Generator) -> Array:
-        _, c = self._blank(rng, self._seconds(rng, 0.9, 2.7))
-        c[:, SPEED] = rng.uniform(0.0, 0.08)
+        t, roll = self._begin(rng, self._seconds(rng, 0.9, 2.7))
+        speed = rng.uniform(0.0, 0.08)
         bend = rng.normal(0.0, 0.5)
-        c[:, _FRONT] = bend
-        c[:, _HIND] = 1.5 * bend
-        c[:, CLIMB], c[:, _ROLL] = np.radians(rng.normal(0.0, 7.0)), c[0, _ROLL]
-        return c
+        climb = np.radians(rng.normal(0.0, 7.0))
+        return self._channels(t, roll[0], speed=speed, climb=climb, front=bend, hind=1.5 * bend)
 
     def _between(self, rng: np.random.Generator, seconds: float | None) -> Array:
         """Unnamed movements: gliding, hovering, weak turns and climbs, swimming backwards."""
         kind = rng.choice(5, p=[0.34, 0.28, 0.2, 0.1, 0.08])
-        t, c = self._blank(
-            rng,
-            seconds
-            or self._seconds(
-                rng, *[(0.2, 1.0), (0.3, 2.0), (0.35, 0.9), (0.5, 1.2), (0.3, 0.8)][kind]
-            ),
-        )
+        spans = [(0.2, 1.0), (0.3, 2.0), (0.35, 0.9), (0.5, 1.2), (0.3, 0.8)]
+        t, roll = self._begin(rng, seconds or self._seconds(rng, *spans[kind]))
         vigour = self.fish.vigour
-        c[:, CLIMB] = np.radians(rng.normal(0.0, 5.0))
-        c[:, TURN] = np.radians(12.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        climb = np.radians(rng.normal(0.0, 5.0))
+        turn = np.radians(12.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        own: dict[str, Array | float] = {"turn": turn, "climb": climb, "beat": 3.0}
         if kind == 0:
-            c[:, SPEED] = vigour * rng.uniform(0.3, 2.2) * np.exp(-t / 0.45)
-            c[:, _WAVE] = rng.uniform(0.0, 0.4)
-            c[:, _BEAT] = 3.0
+            own["speed"] = vigour * rng.uniform(0.3, 2.2) * np.exp(-t / 0.45)
+            own["wave"] = rng.uniform(0.0, 0.4)
         elif kind == 1:
-            c[:, SPEED] = vigour * (0.3 + 0.15 * slow_noise(rng, len(t), 0.4)[:, 0])
-            c[:, _WAVE] = rng.uniform(0.2, 0.9)
-            c[:, _BEAT] = self.fish.tempo * rng.uniform(1.5, 3.5)
-            c[:, _HIND] = 0.6 * slow_noise(rng, len(t), 0.4)[:, 0]
+            own["speed"] = vigour * (0.3 + 0.15 * slow_noise(rng, len(t), 0.4)[:, 0])
+            own["wave"] = rng.uniform(0.2, 0.9)
+            own["beat"] = self.fish.tempo * rng.uniform(1.5, 3.5)
+            own["hind"] = 0.6 * slow_noise(rng, len(t), 0.4)[:, 0]
         elif kind == 2:
             side = self.fish.turn_side(rng)
             total = rng.uniform(10.0, 40.0)
             shape = bump(t, t[-1])
-            self._bent(rng, t, c, side * shape, total, 0.03)
-            c[:, TURN] += (
-                side * np.radians(total * rng.uniform(0.6, 1.0)) * shape / (shape.sum() * STEP_S)
-            )
-            c[:, SPEED] = vigour * rng.uniform(0.2, 1.2)
-            c[:, _WAVE] = rng.uniform(0.1, 0.5)
-            c[:, _BEAT] = 3.0
+            own["front"], own["hind"] = self._bent(rng, side * shape, total, 0.03)
+            angle = side * np.radians(total * rng.uniform(0.6, 1.0))
+            own["turn"] = turn + angle * shape / (shape.sum() * STEP_S)
+            own["speed"] = vigour * rng.uniform(0.2, 1.2)
+            own["wave"] = rng.uniform(0.1, 0.5)
         elif kind == 3:
-            c[:, CLIMB] = np.radians(rng.uniform(6.0, 13.0)) * rng.choice([-1.0, 1.0])
-            c[:, SPEED] = vigour * rng.uniform(0.2, 0.8)
-            c[:, _WAVE] = rng.uniform(0.3, 0.8)
-            c[:, _BEAT] = 3.0
+            own["climb"] = np.radians(rng.uniform(6.0, 13.0)) * rng.choice([-1.0, 1.0])
+            own["speed"] = vigour * rng.uniform(0.2, 0.8)
+            own["wave"] = rng.uniform(0.3, 0.8)
         else:
-            c[:, SPEED] = -vigour * rng.uniform(0.1, 0.5)
-            c[:, _WAVE] = rng.uniform(0.3, 1.0)
-            c[:, _BEAT] = 3.5
-        c[:, SPEED] *= self.length_mm
-        return c
+            own["speed"] = -vigour * rng.uniform(0.1, 0.5)
+            own["wave"] = rng.uniform(0.3, 1.0)
+            own["beat"] = 3.5
+        return self._channels(t, roll, **own)
 
 
 def fish_poses(
     rng: np.random.Generator,
     species: FishSpecies,
-    motion: Motion,
+    motion: ActedMotion,
     rows: NDArray[np.int64],
     size: float,
 ) -> Pose:

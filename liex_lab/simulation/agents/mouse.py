@@ -23,11 +23,12 @@ from liex_lab.simulation.agents.agent import (
     STEP_S,
     TURN,
     UNLABELLED,
+    ActedMotion,
     BehaviourSequence,
     Individual,
-    Motion,
     bump,
     clock,
+    own_shares,
     slow_noise,
 )
 from liex_lab.simulation.pose_prior import Posture, resting_heights, stand
@@ -126,7 +127,7 @@ class MouseActor:
         reach = np.maximum(np.abs(middle + ahead), np.abs(middle - 0.8 * ahead))
         return bool((reach < self.half).all())
 
-    def uncut(self, rng: np.random.Generator, seconds: float) -> Motion:
+    def uncut(self, rng: np.random.Generator, seconds: float) -> ActedMotion:
         """A recording: actions in random order, some of them separated by unnamed movements.
 
         Args:
@@ -141,12 +142,9 @@ class MouseActor:
         rest[_STRETCH] = 1.0
         start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
         sequence = BehaviourSequence(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits)
-        names = list(_SHARES)
-        share = np.array([_SHARES[name] for name in names]) * np.exp(
-            rng.normal(0.0, 0.25, len(names))
-        )
+        names, share = own_shares(rng, _SHARES)
         while sequence.n_steps * STEP_S < seconds:
-            word = str(rng.choice(names, p=share / share.sum()))
+            word = str(rng.choice(names, p=share))
             if word == "rear_supported":
                 self._to_wall(rng, sequence)
             done = self._possible(sequence, word) and sequence.play(
@@ -159,7 +157,7 @@ class MouseActor:
                 UNLABELLED, lambda: self._between(rng), 4
             ):
                 self._turn_home(rng, sequence)
-        return sequence.told()
+        return sequence.motion()
 
     def _possible(self, sequence: BehaviourSequence, word: str) -> bool:
         """Whether a rear is possible here: supported near a wall ahead, else away from walls."""
@@ -276,49 +274,46 @@ class MouseActor:
         c[:, _RISE] += amount * np.radians([0.8, 1.0, 2.0, 5.0]) * slow_noise(rng, len(t), 0.5, 4)
         return t, c
 
-    def _gait(self, c: Array) -> None:
-        """Add the sway of the trunk with the stride."""
-        spines = np.abs(c[:, SPEED]) / self.spine_mm
-        phase = (
-            2
-            * np.pi
-            * np.cumsum(np.sqrt(spines) * _STRIDE_HZ_PER_SPINE * self.mouse.tempo)
-            * STEP_S
-        )
-        sway = 0.06 * np.minimum(spines, 1.0) * np.sin(phase)
-        c[:, _BEND] += sway[:, None] * [1.0, -0.5, -0.5]
+    def _moving(
+        self, c: Array, speed: Array | float, turn: Array | float = 0.0, gait: bool = False
+    ) -> Array:
+        """The channels with a speed, a turning rate and the sway of the trunk with the stride."""
+        c[:, SPEED] = speed
+        c[:, TURN] = turn
+        if gait:
+            spines = np.abs(c[:, SPEED]) / self.spine_mm
+            strides = np.sqrt(spines) * _STRIDE_HZ_PER_SPINE * self.mouse.tempo
+            sway = 0.06 * np.minimum(spines, 1.0) * np.sin(2 * np.pi * np.cumsum(strides) * STEP_S)
+            c[:, _BEND] += sway[:, None] * [1.0, -0.5, -0.5]
+        return c
 
     def _stride(self, rng: np.random.Generator, seconds: float, speed: float) -> Array:
         t, c = self._blank(rng, seconds, 0.7)
-        c[:, SPEED] = speed * np.clip(1.0 + 0.13 * slow_noise(rng, len(t), 0.5)[:, 0], 0.5, 1.5)
-        c[:, TURN] = (
-            np.radians(rng.normal(0.0, 10.0))
-            + np.radians(11.0) * slow_noise(rng, len(t), 0.5)[:, 0]
-        )
         c[:, _STRETCH] += 0.02
-        self._gait(c)
-        return c
+        return self._moving(
+            c,
+            speed * np.clip(1.0 + 0.13 * slow_noise(rng, len(t), 0.5)[:, 0], 0.5, 1.5),
+            np.radians(rng.normal(0.0, 10.0))
+            + np.radians(11.0) * slow_noise(rng, len(t), 0.5)[:, 0],
+            gait=True,
+        )
 
     def _dart(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, 0.15 + self._seconds(rng, 0.4, 0.9), 0.5)
         peak = max(245.0, self.mouse.vigour * rng.uniform(260.0, 520.0)) * self.mouse.size
         burst = t[-1] - 0.15  # it starts and ends at rest
-        c[:, SPEED] = peak * bump(t - 0.05, burst, rng.uniform(0.2, 0.35)) ** 0.7
-        c[:, TURN] = np.radians(rng.normal(0.0, 25.0))
         c[:, _STRETCH] += 0.03
-        self._gait(c)
-        return c
+        speed = peak * bump(t - 0.05, burst, rng.uniform(0.2, 0.35)) ** 0.7
+        return self._moving(c, speed, np.radians(rng.normal(0.0, 25.0)), gait=True)
 
     def _turning(self, rng: np.random.Generator, angle: float, speed: float) -> Array:
         rate = rng.uniform(1.6, 4.2) * self.mouse.tempo
         t, c = self._blank(rng, float(np.clip(abs(angle) / rate, 0.3, 1.3)), 0.7)
         shape = bump(t, t[-1]) ** 0.6
-        c[:, TURN] = angle * shape / (shape.sum() * STEP_S)
         curl = np.sign(angle) * self.mouse.bend * np.radians(rng.uniform(8.0, 30.0))
         c[:, _BEND] += curl * shape[:, None] * [0.6, 0.8, 0.9]
-        c[:, SPEED] = speed * self.mouse.size
-        self._gait(c)
-        return c
+        turn = angle * shape / (shape.sum() * STEP_S)
+        return self._moving(c, speed * self.mouse.size, turn, gait=True)
 
     def _rear(self, rng: np.random.Generator, supported: bool) -> Array:
         t, c = self._blank(rng, 0.35 + self._seconds(rng, 0.6, 3.0), 1.0 if not supported else 0.6)
@@ -331,8 +326,7 @@ class MouseActor:
         if not supported:
             tower = tower + np.radians(4.0) * slow_noise(rng, len(t), 0.35)
         c[:, _RISE] = c[:, _RISE] * (1.0 - up) + (tower + 0.5 * (c[:, _RISE] - self.rest)) * up
-        c[:, SPEED] = rng.uniform(0.0, 12.0)
-        return c
+        return self._moving(c, rng.uniform(0.0, 12.0))
 
     def _hunch(self, rng: np.random.Generator) -> Array:
         """Elevations (4,) of an arched back."""
@@ -359,14 +353,12 @@ class MouseActor:
             + lick
         )
         c[:, 8] += 0.7 * lick
-        c[:, SPEED] = rng.uniform(0.0, 12.0)
-        return c
+        return self._moving(c, rng.uniform(0.0, 12.0))
 
     def _pause(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.4, 2.4), 1.6)
-        c[:, SPEED] = np.abs(rng.uniform(0.0, 32.0) + 10.0 * slow_noise(rng, len(t), 0.4)[:, 0])
-        c[:, TURN] = np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0]
-        return c
+        speed = np.abs(rng.uniform(0.0, 32.0) + 10.0 * slow_noise(rng, len(t), 0.4)[:, 0])
+        return self._moving(c, speed, np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0])
 
     def _freeze(self, rng: np.random.Generator) -> Array:
         _, c = self._blank(rng, self._seconds(rng, 1.2, 5.0), 0.0)
@@ -383,10 +375,9 @@ class MouseActor:
         c[:, 6] += np.radians(rng.uniform(1.0, 3.0)) * np.sin(
             2 * np.pi * rng.uniform(7.0, 10.0) * t
         )
-        c[:, SPEED] = rng.uniform(0.0, 90.0)
-        c[:, TURN] = np.radians(10.0) * slow_noise(rng, len(t), 0.5)[:, 0]
-        self._gait(c)
-        return c
+        speed = rng.uniform(0.0, 90.0)
+        turn = np.radians(10.0) * slow_noise(rng, len(t), 0.5)[:, 0]
+        return self._moving(c, speed, turn, gait=True)
 
     def _stretch(self, rng: np.random.Generator) -> Array:
         t, c = self._blank(rng, self._seconds(rng, 0.7, 2.4), 0.3)
@@ -394,8 +385,7 @@ class MouseActor:
         c[:, _STRETCH] += rng.uniform(0.055, 0.12) * up
         c[:, _RISE] = self.rest * (1.0 - 0.5 * up[:, None]) + 0.5 * (c[:, _RISE] - self.rest)
         c[:, _BEND] *= 0.5
-        c[:, SPEED] = rng.uniform(3.0, 48.0)
-        return c
+        return self._moving(c, rng.uniform(3.0, 48.0))
 
     def _between(self, rng: np.random.Generator) -> Array:
         """Unnamed movements: nose half up, sitting hunched, backing, bending far to one side."""
@@ -423,7 +413,7 @@ class MouseActor:
 def mouse_poses(
     rng: np.random.Generator,
     species: MouseSpecies,
-    motion: Motion,
+    motion: ActedMotion,
     rows: NDArray[np.int64],
     size: float,
     shape: BodyShape,

@@ -31,7 +31,7 @@ _N_POSTURES = 8
 _N_TURNS = 8
 _N_AXES = 6
 _FREE_SHARE = 0.45  # share of random training postures, not based on observations
-SEEN_SHARE = 1.0 - _FREE_SHARE  # share based on the labelled points of NYU test frames
+OBSERVED_SHARE = 1.0 - _FREE_SHARE  # share based on the labelled points of NYU test frames
 _FAN_DEG = {
     "index": 10.0,
     "middle": 1.0,
@@ -104,7 +104,7 @@ class HandPostures:
         )
 
 
-def draw_seen(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
+def draw_observed(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Array, Array]:
     """Draw hands from the observed postures and orientations.
 
     Returns:
@@ -124,10 +124,10 @@ def draw_wide(rng: np.random.Generator, skeleton: Skeleton, n: int) -> tuple[Arr
         Angles (n, J, 3) rad and T_view_palm (n, 3, 3).
     """
     postures = HandPostures.load()
-    seen = postures.draw_angles(rng, skeleton, n)
+    visible = postures.draw_angles(rng, skeleton, n)
     other = postures.draw_angles(rng, skeleton, n)
     t = np.where(rng.random(n) < _BLEND_SHARE, rng.random(n), 0.0)[:, None, None]
-    angles = (1.0 - t) * seen + t * other
+    angles = (1.0 - t) * visible + t * other
     turns = postures.draw_turns(rng, n)
     free = rng.random(n) < _FREE_SHARE
     angles[free] = free_angles(rng, skeleton, int(free.sum()))
@@ -344,7 +344,7 @@ def draw_gestures(
         The hand at n moments.
     """
     keys = 2 + int(n * step_s / _SHORTEST_S)
-    angles, turns = draw_seen(rng, skeleton, keys)
+    angles, turns = draw_observed(rng, skeleton, keys)
     places = middle * rng.uniform(*_NEARER, (keys, 1)) + rng.normal(0.0, _ASIDE_MM, (keys, 3))
     wrists = rng.normal(0.0, 1.0, (keys, 3)) * _WRIST_RAD
     turning = so3.log(np.swapaxes(turns[:-1], 1, 2) @ turns[1:])

@@ -8,37 +8,296 @@ postures come from another person's labelled frames of the NYU Hand Pose data se
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.hand_shape import HandShape, draw_hands
+from liex_lab.body._skinning_kernels import CAPSULE_RINGS, CAPSULE_SEGMENTS, joined_faces
+from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
-from liex_lab.errors import LiexError
+from liex_lab.body.variation import N_ARM_CAPSULES, HandShape, arm_vertices, draw_hands, forearms
 from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.images.nyu import (
     LABEL_CAMERA,
     N_FIRST_PERSON,
     NyuReference,
     fit_hands,
 )
-from liex_lab.recordings.frame import Depth
+from liex_lab.runtime.shapes import Rows
+from liex_lab.runtime.threads import threads
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import sight_rotations
-from liex_lab.simulation._sensor_kernels import PRIMESENSE_KIND
-from liex_lab.simulation.hand import scene
-from liex_lab.simulation.hand.pose_prior import DRAWN, FITTED, draw_gestures, draw_seen, draw_wide
+from liex_lab.simulation import _render_kernels as kernels
+from liex_lab.simulation._render_kernels import PatchCamera, SensorNoise, part_of
+from liex_lab.simulation._sensor_kernels import ANIMAL, NORMAL, OBJECT, PRIMESENSE_KIND
+from liex_lab.simulation.hand.pose_prior import (
+    DRAWN,
+    FITTED,
+    Gestures,
+    draw_gestures,
+    draw_observed,
+    draw_wide,
+)
 from liex_lab.simulation.pose_prior import SIZE_RANGE
-from liex_lab.simulation.recording import OTHER_CAMERA, SEALED, TrueRecording, split_of
+from liex_lab.simulation.recording import OTHER_CAMERA, TrueRecording, planned
+from liex_lab.simulation.scene import PART_FACES, SPHERE_TUBE, rounded
 from liex_lab.simulation.species import KINECT_V2_SENSOR, Sensor, unseen
-from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, _degrade
+from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, degrade
 
 Array = NDArray[np.float64]
+
+DISTANCE_MM = (400.0, 1200.0)
+ARM_FACES = joined_faces([(CAPSULE_RINGS, CAPSULE_SEGMENTS)] * N_ARM_CAPSULES)
+_N_BODY_PARTS = 3  # torso, head, and another object behind
+BODY_FACES = joined_faces([SPHERE_TUBE] * _N_BODY_PARTS)
+_EDGE_MM = 110.0  # minimum distance of the palm from the image border
+
+
+@dataclass(frozen=True)
+class HandFrameContents(Rows):
+    """Hands, n of them, and their surroundings, in the camera frame.
+
+    Attributes:
+        pose: (n) of the hands.
+        joints: (n, J, 3) mm.
+        spine_mm: (n,) lengths of the hands, mm.
+        hand: (n, V, 3) meshes of the hands, mm.
+        arm: (n, A, 3) meshes of the arms, mm.
+        body: (n, B, 3) meshes of torso, head and another object, mm.
+        objects: (n, W, 3) meshes of the distractors, mm.
+        shown: (n,) bool, whether the distractor is present.
+        wall: (n, 4) planes behind everything and their unevenness, as in `draw_hands`.
+        parameters: (n, N_PARAMETERS) of the sensors.
+        seeds: (n,) uint64 of their noise.
+        faces: (F, 3) int32, triangles of the hands' meshes.
+        object_faces: (G, 3) int32, triangles of the distractors' meshes.
+    """
+
+    SHARED = ("faces", "object_faces")
+    pose: Pose
+    joints: Array
+    spine_mm: Array
+    hand: Array
+    arm: Array
+    body: Array
+    objects: Array
+    shown: NDArray[np.bool_]
+    wall: Array
+    parameters: Array
+    seeds: NDArray[np.uint64]
+    faces: NDArray[np.int32]
+    object_faces: NDArray[np.int32] = field(default_factory=lambda: PART_FACES)
+
+    def images(
+        self, cameras: PatchCamera, shape: tuple[int, int], parallel: bool = True
+    ) -> NDArray[np.uint16]:
+        """Render depth images.
+
+        Args:
+            cameras: of the n images.
+            shape: rows and columns of the rendered part.
+            parallel: render on all threads.
+
+        Returns:
+            (n, *shape) uint16 mm, 0 if unread.
+        """
+        parts = (
+            part_of(self.body, BODY_FACES, OBJECT),
+            part_of(self.objects, self.object_faces, OBJECT, self.shown),
+            part_of(self.arm, ARM_FACES, ANIMAL),
+            part_of(self.hand, self.faces, ANIMAL),
+        )
+        noises = SensorNoise(self.parameters, self.seeds, NORMAL)
+        out = np.empty((len(self.seeds), *shape), np.uint16)
+        with threads(parallel):
+            kernels.draw_hands(*parts, self.wall, cameras, noises, out)
+        return out
+
+
+def whole_images(camera: Camera, n: int) -> PatchCamera:
+    """The camera of n whole images."""
+    size = np.array([camera.width, camera.height])
+    return PatchCamera(
+        np.tile(camera.intrinsics, (n, 1)), np.tile(size, (n, 1)), np.zeros((n, 2), np.int64)
+    )
+
+
+def hold_out(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pose:
+    """Poses of hands at given points, oriented relative to the lines of sight.
+
+    Args:
+        rng: not used.
+        skeleton: not used.
+        angles: (n, J, 3) joint angles, rad.
+        turns: (n, 3, 3) T_view_palm, in the view along the line of sight to the palm.
+        size: (n,) over home size.
+        p_camera: (n, 3) of the palms, mm, camera frame.
+
+    Returns:
+        Poses (n) in the camera frame.
+    """
+    rotation = np.swapaxes(sight_rotations(p_camera), 1, 2) @ turns
+    return Pose(SE3(rotation, p_camera), angles, size)
+
+
+def draw_places(
+    rng: np.random.Generator, intrinsics: Array, size_px: Array, low: Array, high: Array
+) -> Array:
+    """Points between two depths and inside their images, uniform in the image.
+
+    Args:
+        rng: random number generator.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        size_px: (n, 2) image width and height, px.
+        low: (n,) smallest depths, mm.
+        high: (n,) largest depths, mm.
+
+    Returns:
+        (n, 3) mm, camera frame.
+    """
+    n = len(low)
+    depth = rng.uniform(low, high)
+    margin = np.minimum(_EDGE_MM * intrinsics[:, 0] / depth, 0.45 * size_px.min(axis=1))
+    uv = margin[:, None] + rng.random((n, 2)) * (size_px - 2.0 * margin[:, None])
+    xy = (uv - intrinsics[:, 2:]) / intrinsics[:, :2] * depth[:, None]
+    return np.concatenate([xy, depth[:, None]], axis=1)
+
+
+def assemble(
+    rng: np.random.Generator,
+    skeleton: Skeleton,
+    pose: Pose,
+    shape: HandShape,
+    size: Array,
+    intrinsics: Array,
+    parameters: Array,
+    object_share: float,
+    scenery: int,
+    wrists: Array | None = None,
+) -> HandFrameContents:
+    """Hands with their arms, bodies, walls and distractors.
+
+    Args:
+        rng: random number generator.
+        skeleton: of the hand.
+        pose: (n) camera frame.
+        shape: (n) the people's hands.
+        size: (n,) over home size.
+        intrinsics: (n, 4) fx, fy, cx, cy, px.
+        parameters: (n, N_PARAMETERS) of the sensors.
+        object_share: share of images with a distractor next to the hand.
+        scenery: number of consecutive images that share body and wall.
+        wrists: (n, 3) wrist rotations, rad; None draws one for every image.
+
+    Returns:
+        The contents of n images.
+    """
+    n = len(size)
+    rotations, positions = shape.joints(skeleton, pose)
+    hand = shape.flesh.vertices(rotations, positions, pose.scale, pose.scale)
+    each = np.arange(n) // scenery
+    n_scenes = int(each[-1]) + 1
+    frame, elbow = forearms(rng, rotations, positions, pose.scale, wrists)
+    body, shoulder = _bodies(positions, elbow, frame[:, :, 0], rng.random((n_scenes, 3, 8))[each])
+    arm = arm_vertices(frame, elbow, shoulder, pose.scale, shape.arm)
+    item, shown = _objects(rng, hand, object_share)
+    wall = _walls(rng, n_scenes, intrinsics[::scenery][:n_scenes], hand, body)[each]
+    seeds = rng.integers(1, 2**63, n).astype(np.uint64)
+    return HandFrameContents(
+        pose,
+        positions,
+        size * skeleton.length,
+        hand,
+        arm,
+        body,
+        item,
+        shown,
+        wall,
+        parameters,
+        seeds,
+        shape.flesh.faces,
+    )
+
+
+def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
+    """Torso, head and one more object (n, V, 3) mm behind each hand, and the shoulders (n, 3) mm.
+
+    The arms lead to the shoulders. u (n, 3, 8) in [0, 1) sets position, size and presence of the
+    three. Without a torso the arm continues straight out of the image.
+    """
+    n = len(joints)
+    behind = np.maximum(joints[:, :, 2].max(axis=1), elbow[:, 2])
+    radii = np.empty((n, 3, 3))
+    centre = np.empty((n, 3, 3))
+    radii[:, 0] = [150.0, 260.0, 90.0] + u[:, 0, :3] * [60.0, 80.0, 60.0]
+    centre[:, 0, 0] = elbow[:, 0] + (2.0 * u[:, 0, 3] - 1.0) * 300.0
+    centre[:, 0, 1] = elbow[:, 1] + (u[:, 0, 4] - 0.4) * 400.0
+    centre[:, 0, 2] = behind + 110.0 + 450.0 * u[:, 0, 5] ** 2 + radii[:, 0, 2]
+    side = np.where(centre[:, 0, 0] > elbow[:, 0], -1.0, 1.0)
+    shoulder = centre[:, 0] + radii[:, 0] * np.stack(
+        [0.7 * side, np.full(n, -0.6), np.full(n, -0.2)], axis=1
+    )
+    radii[:, 1] = [75.0, 105.0, 90.0] + u[:, 1, :3] * 20.0
+    centre[:, 1] = centre[:, 0]
+    centre[:, 1, 0] += 60.0 * (u[:, 1, 3] - 0.5)
+    centre[:, 1, 1] -= radii[:, 0, 1] + 110.0
+    centre[:, 1, 2] = np.maximum(
+        centre[:, 1, 2] - 120.0 * (u[:, 1, 4] - 0.4), behind + 60.0 + radii[:, 1, 2]
+    )
+    radii[:, 2] = 60.0 + 200.0 * u[:, 2, :3]
+    centre[:, 2, :2] = centre[:, 0, :2] + (2.0 * u[:, 2, 3:5] - 1.0) * 500.0
+    centre[:, 2, 2] = behind + 120.0 + radii[:, 2, 2] + 900.0 * u[:, 2, 5]
+    power = np.stack([2.0 + u[:, 0, 6], 2.0 + 0.0 * u[:, 1, 6], 2.0 + 8.0 * u[:, 2, 6]], axis=1)
+    alone = u[:, 0, 7] < 0.25
+    shoulder[alone] = (elbow - 800.0 * forward)[alone]
+    radii[alone, :2] = 0.01
+    radii[u[:, 2, 7] < 0.4, 2] = 0.01
+    return rounded(
+        centre, radii, np.pi * (2.0 * u[:, :, 6] - 1.0) * [0.1, 0.0, 1.0], power
+    ).reshape(n, -1, 3), shoulder
+
+
+def _objects(
+    rng: np.random.Generator, hand: Array, share: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """A block or ball (n, V, 3) mm next to each hand at about its depth, and its presence (n,)."""
+    n = len(hand)
+    radii = rng.uniform(15.0, 60.0, (n, 3))
+    direction = rng.uniform(-np.pi, np.pi, n)
+    toward = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
+    reach = np.einsum("nvk,nk->nv", hand[..., :2], toward).max(axis=1)
+    middle = hand.mean(axis=1)
+    clear = reach - np.sum(middle[:, :2] * toward, axis=1) + np.hypot(radii[:, 0], radii[:, 1])
+    offset = (clear + rng.uniform(10.0, 80.0, n))[:, None] * toward
+    depth = np.maximum(middle[:, 2] + rng.uniform(-30.0, 160.0, n), 300.0)
+    # an object farther away needs a larger offset to appear next to the hand, not behind it
+    centre = np.column_stack(
+        [
+            (middle[:, :2] + offset) * (np.maximum(depth, middle[:, 2]) / middle[:, 2])[:, None],
+            depth,
+        ]
+    )
+    power = np.where(rng.random(n) < 0.5, 2.0, 8.0)
+    return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(n) < share
+
+
+def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, body: Array) -> Array:
+    """A randomly sloped plane (m, 4) behind everything; out of range in a fifth of the scenes."""
+    farthest = max(float(hand[..., 2].max()), float(np.quantile(body[..., 2], 0.9)))
+    distance = np.minimum(farthest, 2000.0) + rng.uniform(150.0, 1500.0, m)
+    slope = rng.normal(0.0, 0.25, (m, 2))
+    a = slope[:, 0] / intrinsics[:, 0] / distance
+    b = slope[:, 1] / intrinsics[:, 1] / distance
+    c = 1.0 / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]
+    wall = np.stack([a, b, c, rng.uniform(0.0, 6.0, m)], axis=1)
+    wall[rng.random(m) < 0.2, :3] = 0.0
+    return wall
+
 
 NYU_SENSOR = Sensor("NYU Kinect", LABEL_CAMERA, PRIMESENSE_KIND)
 FRAME_NS = 33_333_333
@@ -59,7 +318,7 @@ _KINDS = (
     (NYU_SENSOR, 2, 400.0, 700.0, 0.20),
     (KINECT_V2_SENSOR, 1, 400.0, 1000.0, 0.25),
 )
-_THING_SHARE = 0.15
+_OBJECT_SHARE = 0.15
 _LEAST_PX = 320  # smallest height of the images that windows are cut from
 _FLAT = np.array([0.0, 0.0, 1.0])
 _FLOOR_MM = 1300.0  # depth of the plane that replaces the arena's floor
@@ -81,7 +340,7 @@ class HandSession(TrueRecording):
         name: str,
         skeleton: Skeleton,
         sensor: Sensor,
-        contents: scene.HandFrameContents,
+        contents: HandFrameContents,
         times_ns: NDArray[np.int64] | None = None,
     ) -> None:
         """A recording of given contents.
@@ -93,24 +352,21 @@ class HandSession(TrueRecording):
             contents: the hand and its surroundings, n frames, camera frame.
             times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
         """
-        n = len(contents.seeds)
-        times = np.arange(n, dtype=np.int64) * FRAME_NS if times_ns is None else times_ns
+        times = np.arange(len(contents.seeds)) * FRAME_NS if times_ns is None else times_ns
+        floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
         super().__init__(
-            name=name, format="synthetic", camera=sensor.camera, times_ns=times, read=self._depth
+            name,
+            sensor.camera,
+            times,
+            skeleton=skeleton,
+            spine_mm=float(contents.spine_mm[0]),
+            pose=contents.pose,
+            T_arena_camera=floor.T_arena_camera,
+            floor=floor,
+            joints_camera=contents.joints,
         )
-        self.skeleton = skeleton
         self.sensor = sensor
         self.contents = contents
-        self.surface = Surface.of(skeleton)
-        self.spine_mm = float(contents.spine_mm[0])
-        self.floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
-        self.T_arena_camera = self.floor.T_arena_camera
-        self.pose = contents.pose
-        self.joints_camera = contents.joints
-        self.joints_arena = self.T_arena_camera @ contents.joints
-
-    def _depth(self, index: int) -> Depth:
-        return self.depths(index, index + 1)[0]
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth images of a range of frames, rendered on all threads.
@@ -122,15 +378,10 @@ class HandSession(TrueRecording):
         Returns:
             (stop - start, H, W) float32 mm, 0 if unread.
         """
-        c = self.camera
-        part = self.contents[slice(start, stop)]
-        n = len(part.seeds)
-        intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n, 4)).copy()
-        size = np.broadcast_to(np.array([c.width, c.height]), (n, 2)).copy()
-        faces = scene.hand_faces(self.skeleton)
-        return part.pictures(
-            faces, intrinsics, size, np.zeros((n, 2), np.int64), (c.height, c.width)
-        ).astype(np.float32)
+        c = self.sensor.camera
+        cameras = whole_images(c, stop - start)
+        some = self.contents[start:stop]
+        return some.images(cameras, (c.height, c.width)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -177,11 +428,28 @@ class HandSimulator:
         )
 
     def training_blocks(
+        self, seed: int, n_blocks: int, *, first: int = 0, **settings: Any
+    ) -> Iterator[TrainingPatches]:
+        """Blocks of training patches with truth; see `training_patches.training_blocks`.
+
+        Args:
+            seed: of the whole set.
+            n_blocks: number of blocks.
+            first: number of the first block.
+            **settings: family, noise, erosion_px, degraded_share, spine_mm, window_px (320 px) and
+                parallel, as in `training_patches.training_blocks`.
+
+        Yields:
+            The images of one block.
+        """
+        for number in range(first, first + n_blocks):
+            yield self._block(np.random.default_rng([seed, number, 1]), number, **settings)
+
+    def _block(
         self,
-        seed: int,
-        n_blocks: int,
+        rng: np.random.Generator,
+        number: int,
         *,
-        first: int = 0,
         family: str = "train",
         noise: float = 1.0,
         erosion_px: int = 0,
@@ -189,103 +457,42 @@ class HandSimulator:
         spine_mm: float | None = None,
         window_px: int = 320,
         parallel: bool = True,
-    ) -> Iterator[TrainingPatches]:
-        """Blocks of training patches with truth; see `training_patches.training_blocks`.
-
-        The patches have no floor and no background: these are zero.
-
-        Args:
-            seed: of the whole set; a block depends only on the seed and its number.
-            n_blocks: number of blocks.
-            first: number of the first block.
-            family: of hand shapes.
-            noise: multiplies the sensor's random errors and its rate of holes.
-            erosion_px: pixels stripped off the hand's outline.
-            degraded_share: share of mini-sessions with more noise; half of them also have more
-                erosion.
-            spine_mm: mean length of the hands, mm; None uses the skeleton's own.
-            window_px: side of the patches, px.
-            parallel: render on all threads.
-
-        Yields:
-            One set of `BLOCK` patches per block.
-        """
-        for number in range(first, first + n_blocks):
-            rng = np.random.default_rng([seed, number, 1])
-            yield self._block(
-                rng,
-                number,
-                family,
-                noise,
-                erosion_px,
-                degraded_share,
-                spine_mm,
-                window_px,
-                parallel,
-            )
-
-    def _block(
-        self,
-        rng: np.random.Generator,
-        number: int,
-        family: str,
-        noise: float,
-        erosion_px: int,
-        degraded_share: float,
-        spine_mm: float | None,
-        window_px: int,
-        parallel: bool,
     ) -> TrainingPatches:
         """The images of one block."""
         skeleton = self.skeleton
         n = BLOCK
         m = BLOCK // PER_SESSION
         each = np.repeat(np.arange(m), PER_SESSION)
-        kind, intrinsics, picture, parameters = _draw_cameras(rng, m, noise, erosion_px)
-        _degrade(rng, parameters, degraded_share)
+        kind, intrinsics, size_px, parameters = _draw_cameras(rng, m, noise, erosion_px)
+        degrade(rng, parameters, degraded_share)
         shape = draw_hands(rng, skeleton, family, m)[each]
         nominal = 1.0 if spine_mm is None else spine_mm / skeleton.length
         size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
-        low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind[each]]
+        kind, intrinsics, size_px, parameters = (
+            column[each] for column in (kind, intrinsics, size_px, parameters)
+        )
+        low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind]
         angles, turns = draw_wide(rng, skeleton, n)
-        places = scene.draw_places(rng, intrinsics[each], picture[each].astype(float), low, high)
-        pose = scene.hold_out(rng, skeleton, angles, turns, size, places)
-        contents = scene.assemble(
-            rng,
-            skeleton,
-            pose,
-            shape,
-            size,
-            intrinsics[each],
-            parameters[each],
-            _THING_SHARE,
-            PER_SESSION,
+        places = draw_places(rng, intrinsics, size_px.astype(float), low, high)
+        pose = hold_out(angles, turns, size, places)
+        contents = assemble(
+            rng, skeleton, pose, shape, size, intrinsics, parameters, _OBJECT_SHARE, PER_SESSION
         )
-        uv = (
-            contents.hand[..., :2] / contents.hand[..., 2:] * intrinsics[each][:, None, :2]
-            + intrinsics[each][:, None, 2:]
-        )
+        uv = contents.hand[..., :2] / contents.hand[..., 2:] * intrinsics[:, None, :2]
+        uv = uv + intrinsics[:, None, 2:]
         shift = rng.uniform(-0.08, 0.08, (n, 2)) * window_px
-        origin = np.floor((uv.min(axis=1) + uv.max(axis=1)) / 2.0 - window_px / 2.0 + shift).astype(
-            np.int64
-        )
-        origin = np.clip(
-            origin, 0, np.maximum(picture[each] - window_px, 0)
-        )  # an arm leaves a window as it leaves an image
-        depth = contents.pictures(
-            scene.hand_faces(skeleton),
-            intrinsics[each],
-            picture[each],
-            origin,
-            (window_px, window_px),
-            parallel,
-        )
+        middle = (uv.min(axis=1) + uv.max(axis=1)) / 2.0
+        origin = np.floor(middle - window_px / 2.0 + shift).astype(np.int64)
+        # an arm leaves a window as it leaves an image
+        origin = np.clip(origin, 0, np.maximum(size_px - window_px, 0))
+        cameras = PatchCamera(intrinsics, size_px, origin)
+        depth = contents.images(cameras, (window_px, window_px), parallel)
         flat = np.zeros((n, 3))
         return TrainingPatches(
             depth,
             np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
             origin.astype(np.int32),
-            intrinsics[each],
+            intrinsics,
             flat,
             flat,
             SE3.identity(n),
@@ -295,7 +502,7 @@ class HandSimulator:
             contents.joints,
             contents.spine_mm,
             number * m + each,
-            kind[each],
+            kind,
             np.zeros(n, np.int64),
             own_bones=True,
         )
@@ -317,155 +524,92 @@ class HandSimulator:
         Raises:
             LiexError: there is no split of this name.
         """
-        if name not in (*SPLITS, SEALED):
-            raise LiexError(f"there is no split '{name}'; known are {', '.join(SPLITS)}")
         others = unseen((NYU_SENSOR, KINECT_V2_SENSOR))
         sessions = []
-        for k in range(n_sessions):
-            kind = split_of(name, k)
-            seed, family, noise, erosion_px, thing_share = SPLITS[kind]
-            turn = k if name != SEALED else k // len(SPLITS)
+        for turn, kind, settings in planned(name, n_sessions, SPLITS, _SEALED_SEED):
             sensor = others[turn % len(others)] if kind == OTHER_CAMERA else NYU_SENSOR
-            sessions.append(
-                self._session(
-                    [seed if name != SEALED else _SEALED_SEED, k],
-                    f"{name}-{k:02d}",
-                    sensor,
-                    family,
-                    noise,
-                    erosion_px,
-                    thing_share,
-                    spine_mm,
-                )
-            )
+            settings |= {"sensor": sensor, "spine_mm": spine_mm}
+            sessions.append(self._film(N_FRAMES, self._test_hands, **settings))
         return sessions
 
-    def _session(
+    def _film(
         self,
-        seed: list[int],
-        name: str,
-        sensor: Sensor,
-        family: str,
-        noise: float,
-        erosion_px: int,
-        thing_share: float,
-        spine_mm: float | None,
+        n_frames: int,
+        act: Callable[[np.random.Generator, PatchCamera], tuple[Array, Array, Array, Array | None]],
+        *,
+        seed: int | list[int],
+        sensor: Sensor = NYU_SENSOR,
+        family: str = "train",
+        noise: float = 1.0,
+        erosion_px: int = 0,
+        object_share: float = 0.0,
+        spine_mm: float | None = None,
+        name: str = "gestures",
     ) -> HandSession:
-        """Independent frames of one person."""
+        """A recording of one person, whose angles, orientations, places and wrists `act` draws."""
         rng = np.random.default_rng(seed)
-        n = N_FRAMES
-        camera = sensor.camera
+        skeleton = self.skeleton
         drawn = float(rng.uniform(*SIZE_RANGE))
-        size = np.full(n, drawn if spine_mm is None else spine_mm / self.skeleton.length)
-        shape = _same(draw_hands(rng, self.skeleton, family, 1), n)
-        angles, turns = self._test_postures(rng, n)
-        intrinsics = np.broadcast_to(
-            np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (n, 4)
-        ).copy()
-        picture = np.broadcast_to(np.array([camera.width, camera.height]), (n, 2)).copy()
-        low, high = np.full((2, n), np.array(scene.DISTANCE_MM)[:, None])
-        pose = scene.hold_out(
+        size = np.full(n_frames, drawn if spine_mm is None else spine_mm / skeleton.length)
+        shape = draw_hands(rng, skeleton, family, 1)[np.zeros(n_frames, np.int64)]
+        cameras = whole_images(sensor.camera, n_frames)
+        angles, turns, places, wrists = act(rng, cameras)
+        parameters = np.repeat(
+            sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n_frames, axis=0
+        )
+        contents = assemble(
             rng,
-            self.skeleton,
-            angles,
-            turns,
+            skeleton,
+            hold_out(angles, turns, size, places),
+            shape,
             size,
-            scene.draw_places(rng, intrinsics, picture.astype(float), low, high),
+            cameras.intrinsics,
+            parameters,
+            object_share,
+            1 if wrists is None else n_frames,
+            wrists,
         )
-        parameters = np.repeat(sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n, axis=0)
-        contents = scene.assemble(
-            rng, self.skeleton, pose, shape, size, intrinsics, parameters, thing_share, 1
-        )
-        return HandSession(name, self.skeleton, sensor, contents)
+        return HandSession(name, skeleton, sensor, contents)
 
-    def _test_postures(self, rng: np.random.Generator, n: int) -> tuple[Array, Array]:
-        """Angles (n, J, 3) and T_view_palm (n, 3, 3), from the reference (not used in training).
-
-        Without a reference they are drawn from the training statistics.
-        """
+    def _test_hands(
+        self, rng: np.random.Generator, cameras: PatchCamera
+    ) -> tuple[Array, Array, Array, None]:
+        """Independent hands, with postures from the reference (not used in training)."""
+        n = len(cameras.size)
         if self.reference is None:
-            return draw_seen(rng, self.skeleton, n)
-        truth = NyuReference.load(self.reference).truth
-        rows = N_FIRST_PERSON + rng.choice(len(truth) - N_FIRST_PERSON, n, replace=False)
-        pose = fit_hands(self.skeleton, truth[rows]).pose
-        return pose.angles, sight_rotations(pose.root.translation) @ pose.root.rotation
+            angles, turns = draw_observed(rng, self.skeleton, n)
+        else:
+            truth = NyuReference.load(self.reference).truth
+            rows = N_FIRST_PERSON + rng.choice(len(truth) - N_FIRST_PERSON, n, replace=False)
+            pose = fit_hands(self.skeleton, truth[rows]).pose
+            angles, turns = (
+                pose.angles,
+                sight_rotations(pose.root.translation) @ pose.root.rotation,
+            )
+        low, high = np.full((2, n), np.array(DISTANCE_MM)[:, None])
+        places = draw_places(rng, cameras.intrinsics, cameras.size.astype(float), low, high)
+        return angles, turns, places, None
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> HandSession:
-        """A recording of a hand that moves from one gesture to the next.
+        """A recording of one person who moves from gesture to gesture at 30 frames/s, with pauses.
 
         Args:
             seed: seed or seeds of all random numbers.
             n_frames: length of the recording.
-            **settings: sensor, family, noise, erosion_px, thing_share, spine_mm and name, see
-                `gesture_session`.
+            **settings: sensor (the NYU camera), family, noise, erosion_px, object_share, spine_mm
+                and name, as in `locomotion.moving_session`.
 
         Returns:
             The recording with its truth.
         """
-        return gesture_session(self.skeleton, seed, n_frames, **settings)
 
+        def act(rng: np.random.Generator, cameras: PatchCamera) -> Gestures:
+            near, far = np.array([[550.0], [850.0]])
+            size = cameras.size[:1].astype(float)
+            (middle,) = draw_places(rng, cameras.intrinsics[:1], size, near, far)
+            return draw_gestures(rng, self.skeleton, n_frames, FRAME_NS * 1e-9, middle)
 
-def gesture_session(
-    skeleton: Skeleton,
-    seed: int | list[int],
-    n_frames: int,
-    *,
-    sensor: Sensor = NYU_SENSOR,
-    family: str = "train",
-    noise: float = 1.0,
-    erosion_px: int = 0,
-    thing_share: float = 0.0,
-    spine_mm: float | None = None,
-    name: str = "gestures",
-) -> HandSession:
-    """A recording of one person who moves from gesture to gesture at 30 frames/s, with pauses.
-
-    Args:
-        skeleton: of the hand.
-        seed: seed or seeds of all random numbers.
-        n_frames: length of the recording.
-        sensor: the camera's make.
-        family: of hand shapes.
-        noise: multiplies the sensor's random errors and its rate of holes.
-        erosion_px: pixels stripped off the hand's outline.
-        thing_share: share of frames with a distractor next to the hand.
-        spine_mm: length of the hand, mm; None draws it.
-        name: of the recording.
-
-    Returns:
-        The recording with its truth.
-    """
-    rng = np.random.default_rng(seed)
-    drawn = float(rng.uniform(*SIZE_RANGE))
-    size = np.full(n_frames, drawn if spine_mm is None else spine_mm / skeleton.length)
-    shape = _same(draw_hands(rng, skeleton, family, 1), n_frames)
-    c = sensor.camera
-    intrinsics = np.broadcast_to(np.array([c.fx, c.fy, c.cx, c.cy]), (n_frames, 4)).copy()
-    picture = np.array([[c.width, c.height]], float)
-    (middle,) = scene.draw_places(
-        rng, intrinsics[:1], picture, np.array([550.0]), np.array([850.0])
-    )
-    moving = draw_gestures(rng, skeleton, n_frames, FRAME_NS * 1e-9, middle)
-    pose = scene.hold_out(rng, skeleton, moving.angles, moving.turns, size, moving.places)
-    parameters = np.repeat(sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n_frames, axis=0)
-    contents = scene.assemble(
-        rng,
-        skeleton,
-        pose,
-        shape,
-        size,
-        intrinsics,
-        parameters,
-        thing_share,
-        n_frames,
-        moving.wrists,
-    )
-    return HandSession(name, skeleton, sensor, contents)
-
-
-def _same(shape: HandShape, n: int) -> HandShape:
-    """One person's hand repeated for n images."""
-    return shape[np.zeros(n, np.int64)]
+        return self._film(n_frames, act, seed=seed, **settings)
 
 
 def _draw_cameras(
@@ -476,7 +620,7 @@ def _draw_cameras(
     focal = rng.uniform(0.97, 1.03, (m, 1))
     axis = rng.normal(0.0, 4.0, (m, 2))
     intrinsics = np.empty((m, 4))
-    picture = np.empty((m, 2), np.int64)
+    size_px = np.empty((m, 2), np.int64)
     parameters = np.empty((m, 0))
     for k, (sensor, coarse, *_) in enumerate(_KINDS):
         rows = kind == k
@@ -487,5 +631,5 @@ def _draw_cameras(
             np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1) / coarse
         )
         intrinsics[rows] = whole[rows]
-        picture[rows] = (c.width // coarse, max(c.height // coarse, _LEAST_PX))
-    return kind, intrinsics, picture, parameters
+        size_px[rows] = (c.width // coarse, max(c.height // coarse, _LEAST_PX))
+    return kind, intrinsics, size_px, parameters

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,21 +13,32 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
-from liex_lab.simulation.hand.simulator import gesture_session
-from liex_lab.simulation.locomotion import swimming_session
-from liex_lab.simulation.scene import BOX, ROUND, THING_FACES, SimulatedScene, draw_thing
-from liex_lab.simulation.scenes import meshes, places
-from liex_lab.simulation.scenes.cast import (
-    Animal,
+from liex_lab.simulation.hand.simulator import HandSimulator
+from liex_lab.simulation.locomotion import moving_session
+from liex_lab.simulation.scene import (
+    BOX,
+    OBJECT_FACES,
+    ROUND,
+    SimulatedScene,
+    draw_object,
+    floor_point,
+    turned,
+)
+from liex_lab.simulation.scenes import places
+from liex_lab.simulation.scenes.places import Bedding, Ground, Mesh, box, render_still
+from liex_lab.simulation.scenes.stage import (
+    Moving,
+    OneAnimal,
+    SceneAnimal,
+    SceneContents,
+    SceneRecording,
+    TrueScene,
     calm_script,
     keeping_apart,
     timing_of,
     visiting,
 )
-from liex_lab.simulation.scenes.meshes import Mesh, box, render_still, turned
-from liex_lab.simulation.scenes.places import Bedding, Ground
-from liex_lab.simulation.scenes.recording import Moving, OneAnimal, SceneRecording, Stage, TrueScene
-from liex_lab.simulation.species import KINECT_V2_SENSOR, MouseSpecies, Sensor
+from liex_lab.simulation.species import KINECT_V2_SENSOR, FishSpecies, MouseSpecies, Sensor
 
 
 @dataclass(frozen=True)
@@ -35,7 +46,7 @@ class SceneRecipe:
     """The recipe of a scene of mice.
 
     Attributes:
-        says: a description of the scene.
+        title: a description of the scene.
         camera_mm: height of the camera above the floor, mm.
         tilt_rad: of the camera, rad.
         kind: outline of the arena, 'box' or 'round'.
@@ -44,7 +55,7 @@ class SceneRecipe:
         n_arenas: arenas in the image, 1, 2 or 4, each with its own animal.
         around: 'bench', 'untidy' or 'table', see `places`.
         n_animals: in one arena.
-        presence: of the animals, one of `cast.PRESENCES`.
+        presence: of the animals, one of `stage.PRESENCES`.
         worn: '', 'head stage' or 'tether'.
         fixture: '', 'house', 'object' (added during the recording), 'object out' (removed), or
             'lid'.
@@ -53,7 +64,7 @@ class SceneRecipe:
         drift_mm: drift of the sensor's depth while it warms up, mm.
     """
 
-    says: str
+    title: str
     camera_mm: float = 660.0
     tilt_rad: float = 0.06
     kind: str = BOX
@@ -70,92 +81,93 @@ class SceneRecipe:
     drift_mm: float = 0.0
 
 
-def _recipes() -> dict[str, SceneRecipe]:
-    plain = SceneRecipe("one mouse in a clean open field whose floor is the largest plane")
-    unlike = {
-        "small": {
-            "says": "an arena of 30 cm among things of all heights, 15 % of the picture",
-            "camera_mm": 610.0,
-            "half_mm": (150.0, 150.0),
-            "wall_mm": 140.0,
-            "around": "untidy",
-        },
-        "raised": {
-            "says": "an arena on a stool, the room's floor in view 48 cm below",
-            "half_mm": (190.0, 190.0),
-            "wall_mm": 150.0,
-            "around": "table",
-        },
-        "tilted": {
-            "says": "the camera tilted by 35 degrees",
-            "camera_mm": 560.0,
-            "tilt_rad": float(np.radians(35.0)),
-            "half_mm": (230.0, 200.0),
-            "wall_mm": 90.0,
-        },
-        "glossy": {"says": "a glossy floor, unread in places", "glossy": True},
-        "round": {
-            "says": "a round open field",
-            "kind": ROUND,
-            "half_mm": (230.0, 230.0),
-            "wall_mm": 220.0,
-        },
-        "two-arenas": {
-            "says": "two arenas in one picture, a mouse in each",
-            "camera_mm": 720.0,
-            "half_mm": (170.0, 210.0),
-            "wall_mm": 120.0,
-            "n_arenas": 2,
-        },
-        "four-arenas": {
-            "says": "four arenas in one picture, a mouse in each",
-            "camera_mm": 800.0,
-            "half_mm": (165.0, 150.0),
-            "wall_mm": 110.0,
-            "n_arenas": 4,
-        },
-        "tether": {"says": "a cable from the head to a commutator above", "worn": "tether"},
-        "head-stage": {"says": "a head stage of 10 x 8 x 12 mm", "worn": "head stage"},
-        "bedding": {
-            "says": "bedding with lumps of 18 mm that change where the animal walks",
-            "half_mm": (210.0, 180.0),
-            "bedding": True,
-        },
-        "house": {
-            "says": "a shelter into which the animal goes",
-            "half_mm": (240.0, 210.0),
-            "fixture": "house",
-        },
-        "object": {
-            "says": "a novel object, put in during the recording, that stays",
-            "fixture": "object",
-        },
-        "object-out": {
-            "says": "an object that is taken out during the recording",
-            "fixture": "object out",
-        },
-        "asleep": {"says": "motionless for 78 % of the recording", "presence": "asleep"},
-        "still": {"says": "the animal never moves", "presence": "still"},
-        "late": {"says": "the animal is put in after two thirds", "presence": "late"},
-        "leaves": {"says": "the animal is taken out before the middle", "presence": "leaves"},
-        "empty": {"says": "no animal at all", "presence": "never", "n_animals": 0},
-        "two-animals": {"says": "two mice in one arena", "n_animals": 2},
-        "drift": {"says": "the sensor warms up by 5 mm", "drift_mm": 5.0},
-        "cage": {
-            "says": "a home cage with sloping walls, its rim, and the bars of its lid over a third",
-            "camera_mm": 560.0,
-            "half_mm": (185.0, 115.0),
-            "wall_mm": 130.0,
-            "fixture": "lid",
-        },
-    }
-    return {"plain": plain} | {
-        name: replace(plain, **changes)  # type: ignore[arg-type]
-        for name, changes in unlike.items()
-    }
+_PLAIN = SceneRecipe("one mouse in a clean open field whose floor is the largest plane")
+# what a scene has that is unlike a plain one
+_UNLIKE: Mapping[str, Mapping[str, Any]] = {
+    "small": {
+        "title": "an arena of 30 cm among objects of all heights, 15 % of the image",
+        "camera_mm": 610.0,
+        "half_mm": (150.0, 150.0),
+        "wall_mm": 140.0,
+        "around": "untidy",
+    },
+    "raised": {
+        "title": "an arena on a stool, the room's floor in view 48 cm below",
+        "half_mm": (190.0, 190.0),
+        "wall_mm": 150.0,
+        "around": "table",
+    },
+    "tilted": {
+        "title": "the camera tilted by 35 degrees",
+        "camera_mm": 560.0,
+        "tilt_rad": float(np.radians(35.0)),
+        "half_mm": (230.0, 200.0),
+        "wall_mm": 90.0,
+    },
+    "glossy": {"title": "a glossy floor, unread in places", "glossy": True},
+    "round": {
+        "title": "a round open field",
+        "kind": ROUND,
+        "half_mm": (230.0, 230.0),
+        "wall_mm": 220.0,
+    },
+    "two-arenas": {
+        "title": "two arenas in one image, a mouse in each",
+        "camera_mm": 720.0,
+        "half_mm": (170.0, 210.0),
+        "wall_mm": 120.0,
+        "n_arenas": 2,
+    },
+    "four-arenas": {
+        "title": "four arenas in one image, a mouse in each",
+        "camera_mm": 800.0,
+        "half_mm": (165.0, 150.0),
+        "wall_mm": 110.0,
+        "n_arenas": 4,
+    },
+    "tether": {"title": "a cable from the head to a commutator above", "worn": "tether"},
+    "head-stage": {"title": "a head stage of 10 x 8 x 12 mm", "worn": "head stage"},
+    "bedding": {
+        "title": "bedding with lumps of 18 mm that change where the animal walks",
+        "half_mm": (210.0, 180.0),
+        "bedding": True,
+    },
+    "house": {
+        "title": "a shelter into which the animal goes",
+        "half_mm": (240.0, 210.0),
+        "fixture": "house",
+    },
+    "object": {
+        "title": "a novel object, put in during the recording, that stays",
+        "fixture": "object",
+    },
+    "object-out": {
+        "title": "an object that is taken out during the recording",
+        "fixture": "object out",
+    },
+    "asleep": {"title": "motionless for 78 % of the recording", "presence": "asleep"},
+    "still": {"title": "the animal never moves", "presence": "still"},
+    "late": {"title": "the animal is put in after two thirds", "presence": "late"},
+    "leaves": {
+        "title": "the animal is taken out before the middle",
+        "presence": "leaves",
+    },
+    "empty": {"title": "no animal at all", "presence": "never", "n_animals": 0},
+    "two-animals": {"title": "two mice in one arena", "n_animals": 2},
+    "drift": {"title": "the sensor warms up by 5 mm", "drift_mm": 5.0},
+    "cage": {
+        "title": "a home cage with sloping walls, its rim, and its lid over a third",
+        "camera_mm": 560.0,
+        "half_mm": (185.0, 115.0),
+        "wall_mm": 130.0,
+        "fixture": "lid",
+    },
+}
 
 
-RECIPES: Final[Mapping[str, SceneRecipe]] = MappingProxyType(_recipes())
+RECIPES: Final[Mapping[str, SceneRecipe]] = MappingProxyType(
+    {"plain": _PLAIN} | {name: replace(_PLAIN, **changes) for name, changes in _UNLIKE.items()}
+)
 
 
 # Recordings of mice from a recipe and a seed.
@@ -215,7 +227,7 @@ class Making:
         stills, epoch = self._stills(arenas, grounds, beddings, parts)
         fur = animals[0].shape.fur if animals else np.array([0.5])
         noise = self._rng("noise")
-        stage = Stage(
+        stage = SceneContents(
             arenas[0].camera,
             arenas[0].T_arena_camera,
             species,
@@ -235,37 +247,30 @@ class Making:
         return max(_EPOCH_FRAMES, -(-self.n_frames // _EPOCHS))
 
     def _arenas(self) -> list[SimulatedScene]:
-        """The arenas in the image, around the point where the camera's axis meets the floor."""
+        """The arenas in the image, around the point where the camera's axis meets the floor,
+        without their depth images.
+        """
         recipe = self.recipe
         rng = self._rng("camera")
-        camera: Camera = self.sensor.camera
+        camera = self.sensor.camera
         toward = np.pi / 2 + float(rng.uniform(-0.3, 0.3))
         T_arena_camera = places.look_down(recipe.camera_mm, recipe.tilt_rad, toward)
-        yaw = float(rng.uniform(-0.08, 0.08))
-        step = np.array(recipe.half_mm) + 18.0
-        cells = {1: [(0, 0)], 2: [(-1, 0), (1, 0)], 4: [(-1, -1), (1, -1), (-1, 1), (1, 1)]}
-        clutter = np.zeros((0, 2))
-        whole = places.arena_at(
-            camera, T_arena_camera, (0.0, 0.0), recipe.half_mm, yaw, recipe.wall_mm, clutter
+        whole = SimulatedScene(
+            camera,
+            T_arena_camera,
+            recipe.kind,
+            floor_point(camera, T_arena_camera, np.array([camera.cx, camera.cy])),
+            np.asarray(recipe.half_mm, float),
+            float(rng.uniform(-0.08, 0.08)),
+            recipe.wall_mm,
+            np.zeros((0, 2)),
+            np.zeros((0, 0), np.float32),
         )
         if recipe.fixture in ("house", *_OBJECTS):
-            clutter = self._clutter(whole)
-        made = []
-        for cell in cells[recipe.n_arenas]:
-            x, y = turned(step * np.array(cell, float), yaw)
-            made.append(
-                places.arena_at(
-                    camera,
-                    T_arena_camera,
-                    (float(x), float(y)),
-                    recipe.half_mm,
-                    yaw,
-                    recipe.wall_mm,
-                    clutter,
-                    recipe.kind,
-                )
-            )
-        return made
+            whole = replace(whole, clutter=self._clutter(whole))
+        cells = {1: [(0, 0)], 2: [(-1, 0), (1, 0)], 4: [(-1, -1), (1, -1), (-1, 1), (1, 1)]}
+        steps = (whole.half + 18.0) * np.array(cells[recipe.n_arenas], float)
+        return [replace(whole, centre=whole.centre + turned(step, whole.yaw)) for step in steps]
 
     def _house(self, arena: SimulatedScene) -> tuple[Array, float]:
         """Position of a house, (2,) mm, and the direction of its exit, rad."""
@@ -290,7 +295,7 @@ class Making:
 
     def _cast(
         self, species: MouseSpecies, arenas: list[SimulatedScene]
-    ) -> tuple[tuple[Animal, ...], list[Moving], list[Mesh]]:
+    ) -> tuple[tuple[SceneAnimal, ...], list[Moving], list[Mesh]]:
         """The animals, the objects that move with them, and the still objects they need."""
         recipe = self.recipe
         timing = timing_of(recipe.presence, self.n_frames)
@@ -303,30 +308,21 @@ class Making:
             path = visiting(place + 105.0 * ahead, place - 6.0 * ahead, ((0.1, 0.55), (0.72, 0.95)))
             script = calm_script
             still += places.house(arenas[0], place, out)
-        animals: list[Animal] = []
+        animals: list[SceneAnimal] = []
         for which in range(max(recipe.n_animals, recipe.n_arenas) if recipe.n_animals else 0):
             arena = arenas[which % len(arenas)]
             if which and recipe.n_arenas == 1:
                 path = keeping_apart(animals[0].middle(species)[:, :2], animals[0].spine_mm)
-            animals.append(
-                Animal.draw(
-                    self.seed,
-                    which,
-                    species,
-                    arena,
-                    self.family,
-                    self.spine_mm,
-                    timing,
-                    script,
-                    path,
-                )
+            animal = SceneAnimal.draw(
+                self.seed, which, species, arena, self.family, self.spine_mm, timing, script, path
             )
+            animals.append(animal)
         if recipe.fixture in _OBJECTS:
             change = int(_OBJECTS[recipe.fixture] * self.n_frames)
             later = np.arange(self.n_frames) >= change
-            thing = self._object(arenas[0])
-            moving.append(Moving.fixed(thing, later if recipe.fixture == "object" else ~later))
-            moving.append(self._hand(thing.vertices[:, :2].mean(axis=0), change))
+            item = self._object(arenas[0])
+            moving.append(Moving.of(item, later if recipe.fixture == "object" else ~later))
+            moving.append(self._hand(item.vertices[:, :2].mean(axis=0), change))
         if recipe.presence in ("late", "leaves") and animals:
             there = animals[0].present
             change = int(np.argmax(there)) if recipe.presence == "late" else int(there.sum())
@@ -336,20 +332,20 @@ class Making:
 
     def _hand(self, spot: Array, change: int) -> Moving:
         """A hand that moves down to a position, releases or takes something, and leaves."""
-        mesh = draw_thing(self._rng("object"), "hand", 65.0)
+        mesh = draw_object(self._rng("object"), "hand", 65.0)
         mesh[:, 2] -= mesh[:, 2].min()
         reach = _HAND_FRAMES // 2
         height = 45.0 + 22.0 * np.abs(np.arange(-reach, reach + 1))
         vertices = mesh + np.column_stack([np.tile(spot, (len(height), 1)), height])[:, None]
         moment = np.arange(self.n_frames) - change + reach
         there = (moment >= 0) & (moment < len(height))
-        return Moving(vertices, THING_FACES, np.where(there, moment, -1))
+        return Moving(Mesh(vertices, OBJECT_FACES), np.where(there, moment, -1))
 
     def _worn(
         self,
         species: MouseSpecies,
         arena: SimulatedScene,
-        animals: tuple[Animal, ...],
+        animals: tuple[SceneAnimal, ...],
         parts: list[Mesh],
     ) -> list[Moving]:
         """Objects worn by the first animal."""
@@ -357,15 +353,15 @@ class Making:
             return []
         rng = self._rng("worn")
         animal = animals[0]
-        mount = meshes.on_head(species.skeleton, animal.pose, animal.shape[0], animal.girth)
-        sides = meshes.HEAD_STAGE_MM if self.recipe.worn == "head stage" else meshes.PLUG_MM
-        moving = [Moving.always(*meshes.stage_on(mount, sides), animal.present)]
+        mount = places.on_head(species.skeleton, animal.pose, animal.shape[0], animal.girth)
+        sides = places.HEAD_STAGE_MM if self.recipe.worn == "head stage" else places.PLUG_MM
+        moving = [Moving.of(places.stage_on(mount, sides), animal.present)]
         if self.recipe.worn == "tether":
             spot = arena.centre + _COMMUTATOR_MM[:2] + rng.normal(0.0, 15.0, 2)
             above = np.array([*spot, _COMMUTATOR_MM[2]])
-            parts += meshes.holder(above)
-            cable = meshes.tether(rng, mount, above, float(rng.uniform(3.0, 5.0)))
-            moving.append(Moving.always(*cable, animal.present))
+            parts += places.holder(above)
+            cable = places.tether(rng, mount, above, float(rng.uniform(3.0, 5.0)))
+            moving.append(Moving.of(cable, animal.present))
         return moving
 
     def _stills(
@@ -388,31 +384,25 @@ class Making:
         elif recipe.around == "untidy":
             fixed += places.untidy(rng, arenas[0])
         else:
-            middle = np.mean([arena.centre for arena in arenas], axis=0)
-            fixed += places.bench(middle)
+            fixed.append(places.level(np.mean([arena.centre for arena in arenas], axis=0)))
         camera = arenas[0].camera
         T_camera_arena = arenas[0].T_arena_camera.inverse()
-        changing = bool(beddings) or recipe.glossy
-        n_epochs = -(-self.n_frames // self._epoch_frames) if changing else 1
         floors = [] if beddings else [ground.mesh() for ground in grounds]
         base = render_still([*fixed, *floors], camera, T_camera_arena)
+        if not (beddings or recipe.glossy):
+            return base[None], np.zeros(self.n_frames, np.int64)
         bare = render_still(floors, camera, T_camera_arena) == base
-        stills = np.repeat(base[None], n_epochs, axis=0)
+        epoch = np.arange(self.n_frames) // self._epoch_frames
+        stills = np.repeat(base[None], epoch[-1] + 1, axis=0)
         for e, still in enumerate(stills):
             for bedding in beddings:
-                lain = render_still(
-                    [bedding.ground.mesh(bedding.heights[e])], camera, T_camera_arena
-                )
+                mesh = bedding.ground.mesh(bedding.heights[e])
+                lain = render_still([mesh], camera, T_camera_arena)
                 nearer = (lain > 0) & ((still == 0) | (lain < still))
                 still[nearer] = lain[nearer]
             if recipe.glossy:
                 still[bare & _reflections(self._rng("floor"), rng, camera, still.shape)] = 0.0
-        epoch = (
-            np.arange(self.n_frames) // self._epoch_frames
-            if changing
-            else np.zeros(self.n_frames, np.int64)
-        )
-        return stills, epoch.astype(np.int64)
+        return stills, epoch
 
 
 def _reflections(
@@ -486,9 +476,8 @@ def film(
     if name in RECIPES:
         return Making(name, RECIPES[name], seed, n_frames, sensor, family, spine_mm).recording()
     if name == "fish":
-        fish = swimming_session([seed, 5], n_frames, family=family, spine_mm=spine_mm)
+        fish = moving_session(FishSpecies(), [seed, 5], n_frames, family=family, spine_mm=spine_mm)
         return OneAnimal(title, name, fish)
-    hand = gesture_session(
-        Skeleton.load("hand"), [seed, 6], n_frames, family=family, spine_mm=spine_mm
-    )
+    simulator = HandSimulator(Skeleton.load("hand"))
+    hand = simulator.motion([seed, 6], n_frames, family=family, spine_mm=spine_mm)
     return OneAnimal(title, name, hand, mirrored=name == "mirrored-hand")

@@ -8,17 +8,308 @@ lumps at random positions; an animal's steps compress it and push it aside, epoc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body._skinning_kernels import tube_faces
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import BodyShape
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.surface import render_mesh
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.simulation.scene import BOX, ROUND, SimulatedScene, floor_point
-from liex_lab.simulation.scenes.meshes import Mesh, box, field, turned, wall
+from liex_lab.simulation.locomotion import smoothed
+from liex_lab.simulation.scene import ROUND, SimulatedScene, turned, unevenness
 
 Array = NDArray[np.float64]
+CABLE_SEGMENTS = 6
+
+_BOX_CORNERS = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)
+_BOX_FACES = np.array(
+    [
+        *[[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5]],
+        *[[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]],
+    ],
+    np.int32,
+)
+
+
+class Mesh(NamedTuple):
+    """Triangles of one or more objects.
+
+    Attributes:
+        vertices: (V, 3) mm, arena frame.
+        faces: (F, 3) int32.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int32]
+
+
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """One mesh with the triangles of at least one, whose vertices may have a leading axis (n)."""
+    starts = np.cumsum([0, *(part.vertices.shape[-2] for part in parts)])
+    faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
+    vertices = np.concatenate([part.vertices for part in parts], axis=-2)
+    return Mesh(vertices, np.concatenate(faces).astype(np.int32))
+
+
+def box(centre: Sequence[float] | Array, half: Sequence[float] | Array, yaw: float = 0.0) -> Mesh:
+    """A block with sharp edges.
+
+    Args:
+        centre: (3,) mm.
+        half: (3,) half its sides, mm.
+        yaw: its rotation about the vertical, rad.
+    """
+    corners = _BOX_CORNERS * np.asarray(half, float)
+    corners = np.concatenate([turned(corners[:, :2], yaw), corners[:, 2:]], axis=1)
+    return Mesh(corners + np.asarray(centre, float), _BOX_FACES)
+
+
+def field(x: Array, y: Array, heights: Array) -> Mesh:
+    """A surface over a grid, such as an uneven floor.
+
+    Args:
+        x: (n,) mm.
+        y: (m,) mm.
+        heights: (m, n) mm.
+
+    Returns:
+        The mesh, two triangles per cell.
+    """
+    m, n = heights.shape
+    at_x, at_y = np.meshgrid(x, y)
+    first = (np.arange(m - 1)[:, None] * n + np.arange(n - 1)).ravel().astype(np.int32)
+    lower = np.stack([first, first + 1, first + np.int32(n + 1)], axis=-1)
+    upper = np.stack([first, first + np.int32(n + 1), first + np.int32(n)], axis=-1)
+    vertices = np.stack([at_x, at_y, heights], axis=-1).reshape(-1, 3)
+    return Mesh(vertices, np.concatenate([lower, upper]).astype(np.int32))
+
+
+def wall(outline: Array, foot: float, rim: float, thick: float, slope: float = 0.0) -> Mesh:
+    """A closed wall along an outline, with its rim on top.
+
+    Args:
+        outline: (n, 2) its inner foot, counter-clockwise about the origin of the outline, mm.
+        foot: height of its foot, mm.
+        rim: height of its rim, mm.
+        thick: width of the rim, mm.
+        slope: horizontal distance of the rim outside the foot, mm.
+
+    Returns:
+        The mesh: inner face, rim and outer face.
+    """
+    n = len(outline)
+    middle = outline.mean(axis=0)
+    outward = outline - middle
+    reach = np.linalg.norm(outward, axis=1, keepdims=True)
+    rings = [
+        (outline, foot),
+        (middle + outward * (1.0 + slope / reach), rim),
+        (middle + outward * (1.0 + (slope + thick) / reach), rim),
+        (middle + outward * (1.0 + thick / reach), foot),
+    ]
+    vertices = np.concatenate([np.column_stack([xy, np.full(n, z)]) for xy, z in rings])
+    k = np.arange(n, dtype=np.int32)
+    ring = n * np.arange(len(rings) - 1, dtype=np.int32)[:, None]
+    low, low_next = ring + k, ring + (k + 1) % n
+    faces = [[low, low_next, low_next + n], [low, low_next + n, low + n]]
+    return Mesh(vertices, np.moveaxis(np.array(faces, np.int32), 1, -1).reshape(-1, 3))
+
+
+def cables(curves: Array, radius: Array | float) -> Mesh:
+    """Tubes along curves, one per frame.
+
+    Args:
+        curves: (n, R, 3) mm, their midlines.
+        radius: mm, one or (n,).
+
+    Returns:
+        Vertices (n, V, 3) mm and their shared faces (F, 3) int32.
+    """
+    n, rings, _ = curves.shape
+    along = np.gradient(curves, axis=1)
+    along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    side = np.cross(along, np.array([0.31, 0.95, 0.05]))
+    side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
+    other = np.cross(along, side)
+    phi = 2 * np.pi * np.arange(CABLE_SEGMENTS) / CABLE_SEGMENTS
+    around = np.cos(phi)[:, None] * side[:, :, None] + np.sin(phi)[:, None] * other[:, :, None]
+    thick = np.asarray(radius)[..., None, None, None]
+    skin = (curves[:, :, None] + thick * around).reshape(n, -1, 3)
+    vertices = np.concatenate([curves[:, :1], skin, curves[:, -1:]], axis=1)
+    return Mesh(vertices, tube_faces(rings, CABLE_SEGMENTS))
+
+
+def render_still(parts: Sequence[Mesh], camera: Camera, T_camera_arena: SE3) -> NDArray[np.float32]:
+    """Ideal depth of still objects.
+
+    Args:
+        parts: the objects; each within view of the camera, not behind it.
+        camera: the ideal pinhole camera.
+        T_camera_arena: transform from the arena frame into the camera frame.
+
+    Returns:
+        (H, W) float32 mm, 0 for nothing.
+    """
+    if not parts:
+        return np.zeros((camera.height, camera.width), np.float32)
+    mesh = joined(parts)
+    return render_mesh(mesh.vertices, mesh.faces, camera, T_camera_mesh=T_camera_arena)
+
+
+# Equipment of animals: a head stage, and a cable from it to a commutator above the arena.
+
+
+HEAD_STAGE_MM = (10.0, 8.0, 12.0)
+PLUG_MM = (5.0, 5.0, 7.0)
+_NECK = -2  # first joint of the head's bone
+_AT_STATION = 0.83  # of the spine: behind the eyes
+_RINGS = 30
+
+
+def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> SE3:
+    """Pose of an object that is cemented to the skull.
+
+    Args:
+        skeleton: of the animal, a chain.
+        pose: (n) arena frame.
+        shape: its body, or n bodies.
+        girth: (n,) factor of all lengths across the body.
+
+    Returns:
+        (n) T_arena_mount: x forward, z up from the skull, the origin on the skin.
+    """
+    frames = pose.frames(skeleton)
+    stations = np.asarray(skeleton.surface["stations"], float)
+    k = int(np.searchsorted(stations, _AT_STATION)) - 1
+    share = (_AT_STATION - stations[k]) / (stations[k + 1] - stations[k])
+    thick = (1.0 - share) * shape.half_height[..., k] + share * shape.half_height[..., k + 1]
+    reach = np.linalg.norm(skeleton.offsets[1:], axis=1)
+    ahead = (_AT_STATION * reach.sum() - reach[: _NECK + 1].sum()) * pose.scale
+    local = np.stack([ahead, np.zeros_like(ahead), thick * girth], axis=-1)
+    rotation = frames.rotation[:, _NECK]
+    shift = np.einsum("nij,nj->ni", rotation, local)
+    return SE3(rotation, frames.translation[:, _NECK] + shift)
+
+
+def stage_on(mount: SE3, sides_mm: tuple[float, float, float]) -> Mesh:
+    """A block on the head.
+
+    Args:
+        mount: (n) T_arena_mount.
+        sides_mm: its length, width and height.
+
+    Returns:
+        Vertices (n, V, 3) mm, arena frame, and faces (F, 3).
+    """
+    half = 0.5 * np.array(sides_mm)
+    block = box([0.0, 0.0, half[2] - 1.0], half)
+    placed = np.einsum("nij,vj->nvi", mount.rotation, block.vertices) + mount.translation[:, None]
+    return Mesh(placed, block.faces)
+
+
+def tether(rng: np.random.Generator, mount: SE3, commutator: Array, thick_mm: float) -> Mesh:
+    """A flexible cable from the head to a commutator.
+
+    Args:
+        rng: random number generator.
+        mount: (n) T_arena_mount.
+        commutator: (3,) mm, arena frame.
+        thick_mm: its diameter, mm.
+
+    Returns:
+        Vertices (n, V, 3) mm, arena frame, and faces (F, 3).
+    """
+    n = len(mount.translation)
+    way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, (n, 1)), 12.0))
+    longest = float(np.linalg.norm(commutator - mount.translation, axis=-1).max())
+    length = np.full(n, longest * rng.uniform(1.03, 1.08))
+    return cables(_hanging(mount, commutator, length, way), 0.5 * thick_mm)
+
+
+def _hanging(mount: SE3, commutator: Array, length: Array, way: Array) -> Array:
+    """Midlines (n, R, 3) mm of cables that bow towards `way` (n,) rad; `length` (n,) mm."""
+    start = mount.translation + PLUG_MM[2] * mount.rotation[..., 2]
+    span = commutator - start
+    apart = np.linalg.norm(span, axis=-1)
+    bow = 2.0 / np.pi * np.sqrt(apart * np.maximum(length - apart, 0.0))
+    side = np.stack([np.cos(way), np.sin(way), np.full(len(way), -0.15)], axis=-1)
+    s = np.linspace(0.0, 1.0, _RINGS)[:, None]
+    straight = start[:, None] + s * span[:, None]
+    swing = (bow[:, None] * side)[:, None] * np.sin(np.pi * s)
+    # stiff at the plug: it rises from the head before it bends
+    stiff = (25.0 * mount.rotation[..., 2])[:, None] * (s * np.exp(-((s / 0.12) ** 2)) / 0.06)
+    return np.asarray(straight + swing + stiff)
+
+
+def draw_worn(
+    rng: np.random.Generator,
+    skeleton: Skeleton,
+    pose: Pose,
+    shape: BodyShape,
+    girth: Array,
+    share: float,
+    per_session: int,
+) -> tuple[Mesh, NDArray[np.bool_]]:
+    """Head stages and cables of animals in independent postures, for training images.
+
+    Half of the animals with equipment have a head stage of 6 to 14 mm a side, the others a plug and
+    a cable of 2 to 5 mm to their own commutator.
+
+    Args:
+        rng: random number generator.
+        skeleton: of the animals, a chain.
+        pose: (n) arena frame.
+        shape: (n) their bodies.
+        girth: (n,) factors of all lengths across the bodies.
+        share: share of animals with equipment.
+        per_session: consecutive postures of one animal.
+
+    Returns:
+        Their meshes (n, V, 3) mm, arena frame, and whether each posture has them (n,).
+    """
+    n = len(girth)
+    each = np.arange(n) // per_session
+    m = int(each[-1]) + 1
+    wears = rng.random(m) < share
+    tethered = rng.random(m) < 0.5
+    blocks = rng.uniform([7.0, 6.0, 7.0], [14.0, 10.0, 14.0], (m, 3))
+    sides = np.where(tethered[:, None], np.array(PLUG_MM), blocks)[each]
+    mount = on_head(skeleton, pose, shape, girth)
+    block = box([0.0, 0.0, 0.0], [0.5, 0.5, 0.5])
+    local = block.vertices * sides[:, None]
+    local[..., 2] += 0.5 * sides[:, None, 2] - 1.0
+    stage = np.einsum("nij,nvj->nvi", mount.rotation, local) + mount.translation[:, None]
+    away = rng.uniform(0.0, 160.0, m)[each]
+    towards = rng.uniform(-np.pi, np.pi, n)
+    high = rng.uniform(180.0, 320.0, m)[each]
+    above = np.stack([away * np.cos(towards), away * np.sin(towards), high], axis=-1)
+    commutator = mount.translation + above
+    length = np.linalg.norm(above, axis=-1) * rng.uniform(1.0, 1.15, n)
+    curves = _hanging(mount, commutator, length, rng.uniform(-np.pi, np.pi, n))
+    cable, faces = cables(curves, 0.5 * rng.uniform(2.0, 5.0, m)[each])
+    cable = np.where(tethered[each][:, None, None], cable, stage[:, :1])  # one point draws nothing
+    return joined([Mesh(stage, block.faces), Mesh(cable, faces)]), wears[each]
+
+
+def holder(commutator: Array) -> list[Mesh]:
+    """The commutator and the arm that supports it above the arena.
+
+    Args:
+        commutator: (3,) mm, arena frame.
+    """
+    x, y, z = commutator
+    return [
+        box([x, y, z + 14.0], [11.0, 11.0, 14.0]),
+        box([x, y + 400.0, z + 28.0], [7.0, 400.0, 7.0]),
+    ]
+
 
 _GRID_MM = 5.0
 _RIM_MM = 5.0
@@ -52,46 +343,6 @@ def look_down(camera_mm: float, tilt_rad: float, toward_rad: float) -> SE3:
     x = np.array([1.0, 0.0, 0.0]) - up[0] * up
     x /= np.linalg.norm(x)
     return SE3(np.stack([x, np.cross(up, x), up]), np.array([0.0, 0.0, camera_mm]))
-
-
-def arena_at(
-    camera: Camera,
-    T_arena_camera: SE3,
-    shift: tuple[float, float],
-    half: tuple[float, float],
-    yaw: float,
-    wall_mm: float,
-    clutter: Array,
-    kind: str = BOX,
-) -> SimulatedScene:
-    """An arena for the paths of animals, without its depth image.
-
-    Args:
-        camera: the camera.
-        T_arena_camera: its pose.
-        shift: of the arena's centre from the point where the camera's axis meets the floor, mm.
-        half: half its sides, or its radius twice, mm.
-        yaw: its rotation, rad.
-        wall_mm: height of the walls, mm.
-        clutter: (n, 2) points that animals avoid, mm.
-        kind: 'box' or 'round'.
-
-    Returns:
-        The arena; `still` is empty.
-    """
-    axis = np.array([camera.cx, camera.cy])
-    centre = floor_point(camera, T_arena_camera, axis) + np.asarray(shift)
-    return SimulatedScene(
-        camera,
-        T_arena_camera,
-        kind,
-        centre,
-        np.asarray(half, float),
-        yaw,
-        wall_mm,
-        clutter,
-        np.zeros((0, 0), np.float32),
-    )
 
 
 def outline_of_walls(arena: SimulatedScene) -> Array:
@@ -130,14 +381,7 @@ class Ground:
             for reach in arena.half
         )
         local = np.stack(np.meshgrid(x, y), axis=-1)
-        heights = np.zeros(local.shape[:-1])
-        for _ in range(4):
-            way = rng.uniform(-np.pi, np.pi)
-            length = rng.uniform(70.0, 350.0)
-            along = local @ np.array([np.cos(way), np.sin(way)])
-            heights += rng.uniform(0.0, 0.6) * np.sin(
-                2 * np.pi * along / length + rng.uniform(0, 2 * np.pi)
-            )
+        heights = unevenness(rng, local, most=0.6)
         clearance = arena.wall_clearance(arena.centre + turned(local, arena.yaw))
         if arena.wall_mm > 0:
             heights += rng.uniform(0.0, 8.0) * np.exp(
@@ -265,17 +509,13 @@ def walls_of(arena: SimulatedScene, slope: float = 0.0, rim_mm: float = _RIM_MM)
     return [wall(outline_of_walls(arena), -_BASE_MM, arena.wall_mm, rim_mm, slope)]
 
 
-def bench(middle: Array) -> list[Mesh]:
-    """A bench or floor below the arenas, as large as the camera's view.
+def level(middle: Array, z: float = -_BASE_MM) -> Mesh:
+    """A level surface as large as the camera's view, in cells: those behind it are skipped.
 
     Args:
         middle: (2,) below the camera's axis, mm.
+        z: its height, mm; by default that of a bench or floor below the arenas.
     """
-    return [_level(middle, -_BASE_MM)]
-
-
-def _level(middle: Array, z: float) -> Mesh:
-    """A level surface as large as the camera's view, in cells: those behind it are skipped."""
     reach = np.arange(-_FAR_MM, _FAR_MM + 1.0, _CELL_MM)
     return field(middle[0] + reach, middle[1] + reach, np.full((len(reach), len(reach)), z))
 
@@ -293,16 +533,15 @@ def table(rng: np.random.Generator, arena: SimulatedScene, drop_mm: float) -> li
     """
     over = arena.half + rng.uniform(50.0, 90.0, 2)
     top = box([*arena.centre, -_BASE_MM - 12.0], [*over, 12.0], arena.yaw)
-    room = _level(arena.centre, -drop_mm)
-    things = [top, room]
+    objects = [top, level(arena.centre, -drop_mm)]
     for _ in range(3):
         way = rng.uniform(-np.pi, np.pi)
         half = rng.uniform(50.0, 130.0, 3)
         away = (np.hypot(*over) + rng.uniform(60.0, 350.0)) * np.array([np.cos(way), np.sin(way)])
-        things.append(
+        objects.append(
             box([*(arena.centre + away), half[2] - drop_mm], half, rng.uniform(-np.pi, np.pi))
         )
-    return things
+    return objects
 
 
 def untidy(rng: np.random.Generator, arena: SimulatedScene) -> list[Mesh]:
@@ -315,7 +554,7 @@ def untidy(rng: np.random.Generator, arena: SimulatedScene) -> list[Mesh]:
     Returns:
         The meshes, without large level surfaces.
     """
-    things = []
+    objects = []
     reach = float(np.hypot(*arena.half)) + 20.0
     for ring in range(5):
         for _ in range(10 + 5 * ring):
@@ -325,8 +564,8 @@ def untidy(rng: np.random.Generator, arena: SimulatedScene) -> list[Mesh]:
             high = rng.uniform(-90.0, 190.0)
             half[2] = 100.0
             place = arena.centre + away * np.array([np.cos(way), np.sin(way)])
-            things.append(box([*place, high - half[2]], half, rng.uniform(-np.pi, np.pi)))
-    return things
+            objects.append(box([*place, high - half[2]], half, rng.uniform(-np.pi, np.pi)))
+    return objects
 
 
 def lid_bars(arena: SimulatedScene, share: float = 0.35) -> list[Mesh]:

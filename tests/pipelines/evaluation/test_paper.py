@@ -52,7 +52,7 @@ FIGURES = [
 ]
 
 
-class SmallWorld(simulator.MouseSimulator):
+class SmallWorld(simulator.BodySimulator):
     """Two splits of two recordings of a few small frames."""
 
     def __init__(self) -> None:

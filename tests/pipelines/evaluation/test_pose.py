@@ -22,8 +22,8 @@ from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation import recording
 from liex_lab.simulation.recording import SyntheticSession
+from liex_lab.simulation.simulator import BodySimulator, world_of
 from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR, PRIMESENSE_SENSOR
 from liex_lab.tracking.track import Track
 from tests.estimation.toy import trained
@@ -52,7 +52,7 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two recordings of 10 small frames stand for every split, toy models for every variant."""
 
     def small_split(
-        name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any
+        self: BodySimulator, name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any
     ) -> list[SyntheticSession]:
         return [
             SyntheticSession.draw(
@@ -61,7 +61,7 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> None:
             for k in range(min(n_sessions, 2))
         ]
 
-    monkeypatch.setattr(recording, "test_split", small_split)
+    monkeypatch.setattr(BodySimulator, "test_split", small_split)
     for module in (pose, speed):
         monkeypatch.setattr(module, "estimator_of", toy_estimator)
 
@@ -104,10 +104,10 @@ def test_errors_over_sizes_are_in_per_cent_of_the_spine(monkeypatch):
 
 @pytest.mark.usefixtures("small_world")
 def test_the_numbers_of_evaluate_speed_have_their_names(monkeypatch):
-    def one_of_640(name: str, *how: Any) -> list[SyntheticSession]:
+    def one_of_640(self: BodySimulator, name: str, **how: Any) -> list[SyntheticSession]:
         return [SyntheticSession.draw(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
 
-    monkeypatch.setattr(recording, "test_split", one_of_640)
+    monkeypatch.setattr(BodySimulator, "test_split", one_of_640)
     monkeypatch.setattr(speed, "N_FRAMES", 8)
     monkeypatch.setattr(speed, "N_REPEATS", 1)
     result = speed.evaluate_speed("mouse")
@@ -138,7 +138,7 @@ def test_what_is_lost_in_a_rendered_recording_counts_as_lost(monkeypatch):
         return depths
 
     monkeypatch.setattr(SyntheticSession, "depths", without_frame_4)
-    sessions = recording.test_split("clean", n_sessions=1)
+    sessions = world_of(Skeleton.load("mouse")).test_split("clean", n_sessions=1)
     toys = {"": toy_estimator("mouse", "default")}
     errors = pose.errors_of(toys, sessions, Plan.load("mouse"), silent)[""]
     assert np.flatnonzero(np.isnan(errors.error_mm)).tolist() == [4]

@@ -15,7 +15,7 @@ from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior
 from liex_lab.simulation import training_patches
-from liex_lab.simulation.fish import FishSpecies
+from liex_lab.simulation.species import FishSpecies
 from liex_lab.simulation.training_patches import BLOCK, drawn_bodies, training_blocks
 
 N = BLOCK // PER_SESSION

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from liex_lab.body.fitting import Fit, fit_poses
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import Fit, Pose, fit_poses
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.geometry import SE3

@@ -1,0 +1,134 @@
+"""Noise models of sensors: they err as the real ones do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from liex_lab.simulation import _sensor_kernels as k
+from liex_lab.simulation.species import (
+    KINECT_V2_SENSOR,
+    PRIMESENSE_SENSOR,
+    RAYTRIX_R5_SENSOR,
+    Sensor,
+)
+
+SIDE = 240
+
+
+def sensed(
+    sensor: Sensor,
+    depth: np.ndarray | float,
+    what: np.ndarray | int = k.STILL,
+    parameters: np.ndarray | None = None,
+    **changes: float,
+) -> np.ndarray:
+    """Readings of an ideal scene by one unit of a sensor, mm, 0 if unread."""
+    if parameters is None:
+        parameters = sensor.draw(np.random.default_rng(0), 1, np.zeros(1))[0]
+    for name, value in changes.items():
+        parameters[getattr(k, name)] = value
+    ideal = np.full((SIDE, SIDE), depth, np.float32)
+    out = np.empty(ideal.shape, np.uint16)
+    k.sense(
+        ideal,
+        np.full(ideal.shape, what, np.uint8),
+        parameters,
+        sensor.camera.fx,
+        SIDE / 2,
+        SIDE / 2,
+        np.array([99], np.uint64),
+        k.NORMAL,
+        np.empty(ideal.shape, np.float32),
+        out,
+    )
+    return out * parameters[k.UNIT]
+
+
+def typical(sensor: Sensor, noise: float = 1.0) -> np.ndarray:
+    """The mean parameters of 200 units."""
+    p = sensor.draw(np.random.default_rng(0), 200, np.zeros(200), noise).mean(axis=0)
+    p[k.SIDE] = 1.0
+    return p
+
+
+def block(low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
+    """A block 800 mm away, taken for an animal, before a wall at 900 mm."""
+    inside = np.zeros((SIDE, SIDE), bool)
+    inside[low:high, low:high] = True
+    return np.where(inside, 800.0, 900.0), np.where(inside, k.ANIMAL, k.STILL)
+
+
+@pytest.mark.parametrize("sensor", [PRIMESENSE_SENSOR, KINECT_V2_SENSOR])
+def test_noise_grows_with_distance_and_with_the_noise_factor(sensor: Sensor) -> None:
+    near, far, noisy = (
+        sensed(sensor, depth, parameters=typical(sensor, noise))
+        for depth, noise in ((500.0, 1.0), (1500.0, 1.0), (1500.0, 2.0))
+    )
+    spreads = [np.std(out[out > 0]) for out in (near, far, noisy)]
+    assert 0.2 < spreads[0] < 2.0
+    assert spreads[1] > 1.5 * spreads[0]
+    assert 1.6 < spreads[2] / spreads[1] < 2.4
+    assert abs(near[near > 0].mean() - 500.0) < 1.0
+
+
+def test_a_primesense_reads_only_depths_of_whole_eighths_of_disparity() -> None:
+    out = sensed(PRIMESENSE_SENSOR, 3000.0, parameters=typical(PRIMESENSE_SENSOR))
+    eighths = PRIMESENSE_SENSOR.camera.fx * k.BASELINE_MM / out[out > 0] * k.SUBPIXEL
+    assert np.abs(eighths - np.round(eighths)).max() < 0.03  # what rounding to whole mm leaves
+    assert len(np.unique(out)) < 40
+
+
+def test_the_shadow_of_a_step_is_as_wide_as_the_baseline_makes_it() -> None:
+    fb = PRIMESENSE_SENSOR.camera.fx * k.BASELINE_MM
+    width = fb / 700.0 - fb / 900.0
+    ideal = np.full((SIDE, SIDE), 900.0)
+    ideal[:, 60:90] = 700.0
+    quiet = {"NOISE": 0.0, "LUMPS": 0.0, "JITTER": 0.0}
+    for side, band in ((1.0, slice(60 - int(width), 60)), (-1.0, slice(90, 90 + int(width)))):
+        unread = sensed(PRIMESENSE_SENSOR, ideal, SIDE=side, **quiet)[80] == 0
+        assert abs(unread.sum() - width) <= 1.5
+        assert unread[band].mean() > 0.9
+        assert not unread[60:90].any()
+
+
+def test_a_kinect_mixes_depths_at_an_outline_and_a_primesense_does_not() -> None:
+    depth, what = block(60, 100)
+    outs = [sensed(one, depth, what, FLYING=0.5) for one in (PRIMESENSE_SENSOR, KINECT_V2_SENSOR)]
+    structured, time_of_flight = (((out > 820) & (out < 880)).sum() for out in outs)
+    assert time_of_flight > 20 > structured
+
+
+def test_erosion_strips_a_pixel_off_the_animal() -> None:
+    quiet = {"NOISE": 0.0, "FLYING": 0.0, "BIAS": 0.0, "LUMPS": 0.0}
+    outs = [sensed(KINECT_V2_SENSOR, *block(20, 40), EROSION=px, **quiet) for px in (0, 1)]
+    assert [int(((out > 0) & (out < 850)).sum()) for out in outs] == [400, 324]
+
+
+# the light-field camera
+
+
+def plenoptic(distance_mm: float, **changes: float) -> np.ndarray:
+    """A flat animal at a distance."""
+    usual = {"LUMPS": 0.0, "OUTLIERS": 99.0, "DARK": -99.0}
+    return sensed(RAYTRIX_R5_SENSOR, distance_mm, k.ANIMAL, **usual | changes)
+
+
+def test_range_noise_grows_with_the_square_of_the_distance_and_is_mostly_smooth() -> None:
+    near, far, noisy = (
+        plenoptic(distance, SMOOTH=1.0, NOISE=noise)
+        for distance, noise in ((200.0, 1.0), (400.0, 1.0), (200.0, 2.0))
+    )
+    assert near.mean() == pytest.approx(200.0, abs=0.3)
+    assert far.std() / near.std() == pytest.approx(4.0, rel=0.1)
+    assert noisy.std() / near.std() == pytest.approx(2.0, rel=0.1)
+    assert np.diff(near, axis=1).std() < 0.8 * near.std()
+
+
+def test_skin_without_texture_is_unread_or_filled_and_some_is_matched_wrongly() -> None:
+    bare, filled = (plenoptic(250.0, DARK=-0.5, FLYING=filled) for filled in (0.0, 1.0))
+    assert 0.1 < (bare == 0).mean() < 0.5
+    assert (filled == 0).mean() == 0.0
+    assert filled.std() > bare[bare > 0].std()
+    wrong = np.abs(plenoptic(250.0, OUTLIERS=2.4) - 250.0)
+    assert 0.0005 < (wrong > 8.0).mean() < 0.05
