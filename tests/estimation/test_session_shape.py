@@ -152,9 +152,9 @@ def test_frames_without_a_pose_stay_without_one(toy):
 
 def test_the_body_of_a_build_is_as_much_wider_and_higher(toy):
     own = build(np.zeros((toy.skeleton.n_joints, 3)))
-    body = built(toy.skeleton, own.width, own.height).shape
+    body = built(toy.skeleton, own.width, own.height).body
     usual = BodyShape.default(toy.skeleton)
-    assert body is not None
+    assert isinstance(body, BodyShape)
     np.testing.assert_allclose(body.half_width, usual.half_width)
     np.testing.assert_allclose(body.half_height, 1.2 * usual.half_height)
 
