@@ -114,7 +114,13 @@ class CameraView:
                 raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
             lengths[key] = float(value)
         stated = {key: table[key] for key in ("frame", "foreground") if key in table}
-        return CameraView(area=(float(area[0]), float(area[1])), **stated, **lengths)
+        return CameraView(
+            area=(float(area[0]), float(area[1])),
+            behind_mm=lengths["behind_mm"],
+            smooth_mm=lengths["smooth_mm"],
+            min_height_mm=lengths["min_height_mm"],
+            **stated,
+        )
 
 
 MOUSE_VIEW = CameraView()

@@ -160,8 +160,9 @@ class Surface:
         )
         body = self.body.bare() if shape is None else shape
         with threads(parallel and n > _FEW):
-            if not isinstance(body, BodyShape):
+            if isinstance(body, Capsules | MeshBody):
                 return body.vertices(rotations, joints, scale, across).reshape(*batch, -1, 3)
+            assert isinstance(body, BodyShape)
             tube = body.broadcast(n)
             straight = np.zeros((n, skinning_kernels.TAIL_RINGS))
             out = np.empty((n, self.n_vertices, 3))

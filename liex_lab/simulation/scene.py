@@ -46,12 +46,12 @@ OBJECT_FACES = joined_faces([SPHERE_TUBE] * N_PARTS)
 PART_FACES = joined_faces([SPHERE_TUBE])
 
 
-def turned(xy: Array, yaw: float) -> Array:
+def turned(xy: Array, yaw: Array | float) -> Array:
     """Points rotated about the vertical.
 
     Args:
         xy: (..., 2) mm.
-        yaw: rad.
+        yaw: one, or one of each point (...), rad.
 
     Returns:
         (..., 2) mm.

@@ -146,7 +146,8 @@ class Sensor:
                 # texture, less of the rest
                 k.DARK: rng.uniform(-2.6, -0.45, n),
                 k.HOLES: rng.uniform(-4.0, -1.2, n),
-                k.FLYING: rng.random(n) < 0.5,  # the maker's software fills unread pixels
+                # the maker's software fills unread pixels
+                k.FLYING: (rng.random(n) < 0.5).astype(float),
             }
         else:
             columns |= {

@@ -21,7 +21,10 @@ def girths(skeleton: Skeleton, family: str, n: int = 800) -> np.ndarray:
     body = vary_body(np.random.default_rng(1), skeleton, family, n)
     default = Surface.of(skeleton).body
     if isinstance(body, Capsules):
+        assert isinstance(default, Capsules)
         return (body.radii / default.radii).reshape(n, -1)
+    assert isinstance(body, BodyShape)
+    assert isinstance(default, BodyShape)
     thick, usual = (np.sqrt(one.half_width * one.half_height) for one in (body, default))
     return thick[:, 2:-2] / usual[2:-2]
 

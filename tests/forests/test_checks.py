@@ -88,18 +88,18 @@ def test_every_wrong_index_is_refused():
     # back, onto itself, or past the last: a descent would read elsewhere or never end
     wrong += [
         (with_node(row, 2, child), "child")
-        for row in INNER
+        for row in INNER.tolist()
         for child in (0, row - 1, row, len(IS_LEAF) - 1, len(IS_LEAF), *beyond)
         if child >= 0
     ]
     wrong += [
         (with_node(row, 2, -leaf - 1), "leaf")
-        for row in np.flatnonzero(IS_LEAF)
+        for row in np.flatnonzero(IS_LEAF).tolist()
         for leaf in (5, 6, *beyond)
     ]
     tests = [3, 0 + 4 * N_VIEWS, ONE_PROBE + 4 * N_VIEWS, SCALAR + 4 * N_SCALARS, 4 * (2**28)]
     tests += [-1, -4, ONE_PROBE - 4, SCALAR - 4, -(2**31)]
-    wrong += [(with_node(row, 3, test), "test") for row in INNER for test in tests]
+    wrong += [(with_node(row, 3, test), "test") for row in INNER.tolist() for test in tests]
     circle = small().nodes.copy()
     circle[[0, 1], 2] = 1, 0
     wrong.append((replace(small(), nodes=circle), "child"))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -65,7 +67,7 @@ def test_the_inverse_of_the_left_jacobian_is_its_inverse(omega: Array) -> None:
 
 
 @pytest.mark.parametrize("function", [so3.exp, so3.left_jacobian, so3.left_jacobian_inverse])
-def test_series_and_formula_meet_where_they_part(function: object) -> None:
+def test_series_and_formula_meet_where_they_part(function: Callable[[list[float]], Array]) -> None:
     for limit in (1e-4, 1e-3):
         below, above = (
             function([0.0, 0.0, limit * (1 - 1e-9)]),

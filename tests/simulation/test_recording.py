@@ -14,8 +14,8 @@ from liex_lab.errors import LiexError
 from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.pose_prior import KINDS, SHARES, sample_postures
 from liex_lab.simulation.recording import SEALED, SEALED_SEED, SPLITS, SyntheticSession, split_of
-from liex_lab.simulation.simulator import world_of
-from liex_lab.simulation.species import SENSORS
+from liex_lab.simulation.simulator import BodySimulator, world_of
+from liex_lab.simulation.species import SENSORS, MouseSpecies
 from liex_lab.simulation.training_patches import (
     PER_SESSION,
     TrainingPatches,
@@ -24,7 +24,7 @@ from liex_lab.simulation.training_patches import (
 )
 
 MOUSE = Skeleton.load("mouse")
-WORLD = world_of(MOUSE)
+WORLD = BodySimulator(MouseSpecies(MOUSE))
 N = 64  # patches of a block, see conftest
 
 
@@ -160,7 +160,8 @@ def test_a_session_is_a_recording_that_reads_the_same_in_any_order(
     chunks = [frame for chunk in session.chunks(5) for frame in chunk]
     assert [frame.index for frame in chunks] == list(range(12))
     np.testing.assert_array_equal(chunks[9].depth, late)
-    assert (late.shape, late.dtype) == ((session.height, session.width), np.float32)
+    assert late.shape == (session.height, session.width)
+    assert late.dtype == np.float32
     assert np.isfinite(late).all()
     assert (late >= 0).all()
     assert session.format == "synthetic"

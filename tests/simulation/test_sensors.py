@@ -21,6 +21,7 @@ def sensed(
     depth: np.ndarray | float,
     what: np.ndarray | int = k.STILL,
     parameters: np.ndarray | None = None,
+    /,
     **changes: float,
 ) -> np.ndarray:
     """Readings of an ideal scene by one unit of a sensor, mm, 0 if unread."""
@@ -62,7 +63,7 @@ def block(low: int, high: int) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("sensor", [PRIMESENSE_SENSOR, KINECT_V2_SENSOR])
 def test_noise_grows_with_distance_and_with_the_noise_factor(sensor: Sensor) -> None:
     near, far, noisy = (
-        sensed(sensor, depth, parameters=typical(sensor, noise))
+        sensed(sensor, depth, k.STILL, typical(sensor, noise))
         for depth, noise in ((500.0, 1.0), (1500.0, 1.0), (1500.0, 2.0))
     )
     spreads = [np.std(out[out > 0]) for out in (near, far, noisy)]
@@ -73,7 +74,7 @@ def test_noise_grows_with_distance_and_with_the_noise_factor(sensor: Sensor) -> 
 
 
 def test_a_primesense_reads_only_depths_of_whole_eighths_of_disparity() -> None:
-    out = sensed(PRIMESENSE_SENSOR, 3000.0, parameters=typical(PRIMESENSE_SENSOR))
+    out = sensed(PRIMESENSE_SENSOR, 3000.0, k.STILL, typical(PRIMESENSE_SENSOR))
     eighths = PRIMESENSE_SENSOR.camera.fx * k.BASELINE_MM / out[out > 0] * k.SUBPIXEL
     assert np.abs(eighths - np.round(eighths)).max() < 0.03  # what rounding to whole mm leaves
     assert len(np.unique(out)) < 40

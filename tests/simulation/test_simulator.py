@@ -16,7 +16,7 @@ from liex_lab.simulation import training_patches
 from liex_lab.simulation.locomotion import moving_session
 from liex_lab.simulation.pose_prior import draw_angles
 from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.simulator import world_of
+from liex_lab.simulation.simulator import BodySimulator, world_of
 from liex_lab.simulation.species import GenericSpecies
 
 SNAKE = Skeleton.load(find_sample("snake.toml"))
@@ -120,6 +120,8 @@ def test_a_window_holds_the_animal_wherever_it_is(monkeypatch):
     monkeypatch.setattr(training_patches, "BLOCK", 32)
     for skeleton in (SNAKE, STAR):
         world = world_of(skeleton)
+        assert isinstance(world, BodySimulator)
+        assert isinstance(world.species, GenericSpecies)
         (block,) = world.training_blocks(11, 1, window_px=world.species.window_px(skeleton.length))
         uv = block.joints_mm[..., :2] / block.joints_mm[..., 2:] * block.intrinsics[:, None, :2]
         uv = uv + block.intrinsics[:, None, 2:] - block.origin[:, None]
@@ -138,7 +140,8 @@ def test_an_unknown_animal_moves_smoothly_over_the_floor():
 @pytest.mark.parametrize("animal", ["fish", "snake"])
 def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it(animal):
     world = world_of(SNAKE if animal == "snake" else Skeleton.load(animal))
-    skeleton, species = world.skeleton, world.species  # type: ignore[attr-defined]
+    assert isinstance(world, BodySimulator)
+    skeleton, species = world.skeleton, world.species
     recording = SyntheticSession.draw([13, 2], 20, species=species)
     spans = (0.6 * skeleton.length, 1.5 * skeleton.length)
     scene, sample = learn_scene(recording, spans, 20, skeleton.view.min_height_mm, skeleton.view)

@@ -468,9 +468,8 @@ class HandSimulator:
         shape = draw_hands(rng, skeleton, family, m)[each]
         nominal = 1.0 if spine_mm is None else spine_mm / skeleton.length
         size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
-        kind, intrinsics, size_px, parameters = (
-            column[each] for column in (kind, intrinsics, size_px, parameters)
-        )
+        kind, intrinsics = kind[each], intrinsics[each]
+        size_px, parameters = size_px[each], parameters[each]
         low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind]
         angles, turns = draw_wide(rng, skeleton, n)
         places = draw_places(rng, intrinsics, size_px.astype(float), low, high)

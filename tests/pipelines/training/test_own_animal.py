@@ -20,8 +20,8 @@ from liex_lab.estimation.model import Model
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.sessions import Session
-from liex_lab.simulation import recording as synthetic
 from liex_lab.simulation import training_patches
+from liex_lab.simulation.simulator import BodySimulator
 
 SNAKE = str(find_sample("snake.toml"))
 
@@ -90,9 +90,9 @@ def test_a_whole_model_finds_rendered_snakes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = pose_model.train_model(SNAKE, "default", tmp_path / "snake.npz", n_images=1024)
-    drawn = synthetic.test_split
+    drawn = BodySimulator.test_split
     monkeypatch.setattr(
-        synthetic, "test_split", lambda name, spine, n, species: drawn(name, spine, 2, species)
+        BodySimulator, "test_split", lambda world, name, spine_mm: drawn(world, name, spine_mm, 2)
     )
     result = evaluate_pose(SNAKE, "clean", model=model)
     assert result["n_frames"] == 100
