@@ -140,10 +140,7 @@ def imported_ahead(*modules: str) -> Iterator[None]:
 
 @contextmanager
 def threads(parallel: bool) -> Iterator[None]:
-    """Within the block, parallel numba kernels run on all threads or on one.
-
-    One kernel serves both: two numba functions made from one Python function, with and without
-    parallel=True, share a cache entry, and whichever was compiled first is loaded for both.
+    """Within the block, `in_parallel` and numba's parallel loops use all threads or one.
 
     Args:
         parallel: whether to keep the current number of threads; False uses one.
