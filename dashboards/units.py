@@ -1,7 +1,5 @@
 """Units, numbers and dates in the form shown on pages; see `tables.units`."""
 
-from __future__ import annotations
-
 import math
 from datetime import datetime
 from functools import cache

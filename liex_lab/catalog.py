@@ -4,8 +4,6 @@ A model is an .npz file of arrays; its card is the JSON file of the same name, w
 model's SHA-256. A model whose SHA-256 differs from its card is refused.
 """
 
-from __future__ import annotations
-
 import difflib
 import hashlib
 import json

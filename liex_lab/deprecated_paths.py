@@ -5,8 +5,6 @@ folders beside it in a clone. A documented path of an earlier version that is go
 that names its successor.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec

@@ -3,8 +3,6 @@
 Each message is one sentence: what was expected, what was found, what to do.
 """
 
-from __future__ import annotations
-
 import unicodedata
 from typing import ClassVar
 

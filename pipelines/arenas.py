@@ -6,8 +6,6 @@ track, checkpoint and folder, NAME-ARENA.liex, and its tables are byte-identical
 with that region alone. If one arena fails, the others continue.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing

@@ -7,8 +7,6 @@ recording and its mirror image are both tried, and the wrong one's predicted err
 large.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -5,8 +5,6 @@ assigned to a group, with false discovery rates over the whole table (see `behav
 session of a study is accounted for: it is compared, or the reason why not is given.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -7,8 +7,6 @@ on disk, where the run finds them. Kernels that are not listed are compiled when
 so an outdated list only costs time.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

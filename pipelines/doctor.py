@@ -6,8 +6,6 @@ fits, the only check that needs models. `FINDINGS` lists every number with its u
 sentences that state what to do.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Figures and videos: `liex figures`, `liex export --to video`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ passes it to the online tracker, which has no lag; frames that have waited are m
 At the end of the recording the offline tracker computes the whole track.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from itertools import chain, islice, tee

@@ -6,8 +6,6 @@ edited in place, with all comments kept; its new content is first parsed as a ru
 file is replaced as a whole.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import shlex

@@ -5,8 +5,6 @@ of them dropped as by a camera; 16-bit depth, mm, in Foxglove messages. It is re
 so the same code and package versions write the same bytes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

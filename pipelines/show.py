@@ -4,8 +4,6 @@ A session keeps cut-outs of the depth; the linked recording has all of it. Its i
 into a separate replay, which Rerun displays together with the session's.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

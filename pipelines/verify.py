@@ -5,8 +5,6 @@ their own checksums and lengths. If the recording is given, it is measured again
 compared byte by byte, or else row by row.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ compiled as serial ones. The forests' walk in `liex_lab.forests._walk` is LLVM c
 stays unchecked.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Names that a recording or a session of somebody else may bear, to have us write elsewhere."""
 
-from __future__ import annotations
-
 NAMES = (
     "",
     " ",

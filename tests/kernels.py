@@ -6,8 +6,6 @@ down. Kernels that decode a kind of file or render are left out: not every run n
 some minutes an animal.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

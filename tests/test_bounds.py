@@ -1,7 +1,5 @@
 """No kernel reads beyond its arrays while the kernels' own tests run: .ci/with-bounds."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

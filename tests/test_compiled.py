@@ -1,7 +1,5 @@
 """Compiled code on disk: each compiled function finds its own again."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections import defaultdict

@@ -2,8 +2,6 @@
 was rendered from.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A documented path that is gone names its successor."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from importlib.util import find_spec
 

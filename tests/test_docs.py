@@ -1,7 +1,5 @@
 """What the pages for people say is there, is there; one version everywhere."""
 
-from __future__ import annotations
-
 import re
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is said on a terminal is text: no name of a file or person does anything there."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

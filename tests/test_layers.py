@@ -1,7 +1,5 @@
 """An import only ever goes down, and importing the package brings nothing heavy along."""
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What pyproject.toml, README.md and .ci/run say about each other and about the folders."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -6,8 +6,6 @@ place of a name, what takes too long, and what is not run, with the reason. READ
 every run of the tests, the manual's pages every night.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """What README.md and the manual in docs/ say is there, is there."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import fields

@@ -5,8 +5,6 @@ order. Its thirteenth, a failed flip classifier that turns every frame round, ha
 nothing here is turned round behind the user's back, and what will be is a row of flips.parquet.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

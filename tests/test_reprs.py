@@ -1,7 +1,5 @@
 """What the objects of the Python interface say of themselves: short, in people's words."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import liex_lab

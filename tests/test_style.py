@@ -2,8 +2,6 @@
 states its types.
 """
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

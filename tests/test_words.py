@@ -3,8 +3,6 @@
 A limit is what is left today. It only ever goes down; at 0 the word is gone.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 from pathlib import Path

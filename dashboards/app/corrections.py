@@ -5,8 +5,6 @@ session are applied in one batch. The report takes longer; it is made again afte
 corrections. A page polls the state of its corrections.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

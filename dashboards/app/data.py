@@ -4,8 +4,6 @@ The cache is kept until a session's files change (their time, size and inode). G
 come from `liex_lab.behaviour.cohort`.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -4,8 +4,6 @@ A session of an hour has a hundred thousand frames, so the page requests the joi
 rows at a time, and one image at a time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
 from itertools import combinations

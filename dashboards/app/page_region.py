@@ -4,8 +4,6 @@ The page's script draws. It requests JSON and PNG images here, and what it saves
 written by the owner of the plans (`Regions`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Protocol
 

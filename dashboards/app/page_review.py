@@ -4,8 +4,6 @@ A rater's browser only receives a clip's number and requests images and joints b
 labels of the program and of other raters are sent after the rater's last answer.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures of the floor from above: occupancy, trajectory, and the arena's heights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

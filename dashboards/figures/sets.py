@@ -1,7 +1,5 @@
 """The sets of figures of a session, a study and a comparison, and their files."""
 
-from __future__ import annotations
-
 import difflib
 import io
 import json

@@ -5,8 +5,6 @@ edited. The colours of ink and paper are distinct in the SVG, so that a page can
 mode).
 """
 
-from __future__ import annotations
-
 import io
 import re
 import threading

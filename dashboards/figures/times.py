@@ -1,7 +1,5 @@
 """Figures of one animal over time and by action: ethogram, curves, budgets, distributions."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -3,8 +3,6 @@
 Nothing is computed here except the errors printed next to the poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill

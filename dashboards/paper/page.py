@@ -4,8 +4,6 @@ The data come from `liex evaluate tables`, the sentences from `templates`. The p
 figures and loads nothing from the network.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

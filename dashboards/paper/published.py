@@ -3,8 +3,6 @@
 Constants only: `liex evaluate tables --help` prints the differences without loading anything else.
 """
 
-from __future__ import annotations
-
 TITLES = {
     "default": "liex_lab (default)",
     "paper": "Lie-X, the paper's variant",

@@ -1,7 +1,5 @@
 """Layouts of a replay: the Rerun blueprint, and the Foxglove layout of session.mcap."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ An image is a PNG of a few pixels inside an SVG, so that the skeleton stays shar
 in units of the SVG's viewBox.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Thresholds of the warnings: 2 % of the frames lost, 5 % doubtful, a predicted jo
 the length, a speed noise as large as the pause threshold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 It needs no network and no script. Every number comes from the session's tables and session.json.
 """
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """One session as a film: its image at any time, with skeletons, trail, action and time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any

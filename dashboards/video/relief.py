@@ -6,8 +6,6 @@ n is the arena's vertical in the camera frame and d the camera's height, so the 
 camera is level as well. Shading is Lambert's, with light from the upper left.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2

@@ -4,8 +4,6 @@ Clips are aligned: all begin a moment before the onset of their bout, and a fini
 and dimmed until the longest ends. Of too many bouts, an evenly spaced selection is used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass

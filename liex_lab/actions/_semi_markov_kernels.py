@@ -11,8 +11,6 @@ first state, with the total at the end; stay, leave (K,) log probabilities of th
 (K, K) log probabilities of the next action, about -inf for itself.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.runtime.kernels import inner_kernel, kernel

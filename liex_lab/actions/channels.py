@@ -10,8 +10,6 @@ Frames whose trunk points against those within 0.15 s to either side are left ou
 were exchanged). Gaps up to 0.4 s are bridged; longer ones split the track into segments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

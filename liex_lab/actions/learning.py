@@ -5,8 +5,6 @@ Adam on cross-entropy (`mlp.descend`); durations and transitions come from count
 Validation is leave-one-animal-out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -3,8 +3,6 @@
 Format 2; format 1 had no peaks and is still read.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import zipfile

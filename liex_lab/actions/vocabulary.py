@@ -5,8 +5,6 @@ printed after it and the check of every bout (`behaviour.bouts`) all come from t
 Thresholds are starting values, from the literature.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

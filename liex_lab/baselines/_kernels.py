@@ -4,8 +4,6 @@ F1's trees vote from pixels for the base's position and heading, F2's trees for 
 is the mean-shift mode of the votes (Lie-X section 5.2).
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -11,8 +11,6 @@ For a fish, the shares of the time in the top and bottom third of the water are 
 of the observed time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -17,8 +17,6 @@ sessions or bouts.
 `liex_lab.behaviour.cohort` calls all of them.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

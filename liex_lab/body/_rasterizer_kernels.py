@@ -7,8 +7,6 @@ triangle are drawn: in a closed surface the nearer side hides the other anyway, 
 body folds into itself the back of a triangle can be the visible side.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -11,8 +11,6 @@ with tangents m of the parabola through three joints. Lengths in mm, in the fram
 tail needs that frame's z up and its floor at z = 0.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -6,8 +6,6 @@ factors (clipped at two standard deviations) of bone lengths finger by finger, o
 and of the capsules' radii; a forearm, a sleeve and an upper arm are more capsules behind the wrist.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands that train and evaluate models: `liex train` and `liex evaluate`."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Sequence
 from functools import wraps

@@ -6,8 +6,6 @@ paper's Hough votes). A thread processes `FRAMES` frames at once. Their candidat
 together, LANES at a time, so that a tree stays in the cache and all vector registers are used.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

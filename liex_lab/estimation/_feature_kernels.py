@@ -12,8 +12,6 @@ row-major) of T_view_camera, distance of the camera above the view's origin (its
 or the upright camera frame of the paper's variant.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

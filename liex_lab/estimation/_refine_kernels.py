@@ -7,8 +7,6 @@ of the readings are pushed behind them (both with Geman-McClure weights 1 / (1 +
 spheres outside the animal are pulled back onto it, and a prior keeps the pose near its start.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

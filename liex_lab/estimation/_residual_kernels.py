@@ -7,8 +7,6 @@ sphere, and of the spheres' fronts from the readings under them. The body is tha
 `body.shape.Spheres`.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

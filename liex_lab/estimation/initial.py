@@ -7,8 +7,6 @@ method starts along the principal axis of the foreground in both directions, wit
 initialisation), which needs fewer initial poses.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr

@@ -17,8 +17,6 @@ predicted error come from predictions for folds excluded from the forest's train
 conformal prediction).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 

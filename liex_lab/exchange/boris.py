@@ -4,8 +4,6 @@ The fields are those of BORIS 9. A state event is two rows of the same subject a
 and stop. BORIS refuses a project newer than itself, so the oldest sufficient version is written.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """Registry of export formats and the one function that writes them."""
 
-from __future__ import annotations
-
 import difflib
 import io
 import math

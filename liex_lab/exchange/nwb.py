@@ -10,8 +10,6 @@ and all facts on the animal are in `notes`, a field of every NWB file, as lines 
 `scratch` is not meant for sharing, and other programs could not read a type of our own.
 """
 
-from __future__ import annotations
-
 import json
 from datetime import datetime
 from pathlib import Path

@@ -22,8 +22,6 @@ crop pixel (column, row) of the joint, a 2x3 matrix from offsets (1/127 of the r
 frame) to crop pixels, and the joint's own height.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.runtime.kernels import inner_kernel, kernel

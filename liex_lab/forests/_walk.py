@@ -13,8 +13,6 @@ the start of a sample's map in it, `scalar_base` int32 (n,) the start of its sca
 multiple of LANES; lanes without a sample may contain zeros.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import llvmlite.binding as llvm

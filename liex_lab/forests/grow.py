@@ -11,8 +11,6 @@ out-of-bag predictions are independent of the image. `boost_forest` grows pairs 
 residuals of those before them (Friedman, Stochastic gradient boosting, 2002).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 

@@ -5,8 +5,6 @@
 Matrices this small (at most some dozen rows) do not justify a LAPACK call.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.runtime.kernels import inner_kernel, kernel

@@ -5,8 +5,6 @@
 Small angles use the series of these factors. Vectors are (..., 3) radians, rotations (..., 3, 3).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

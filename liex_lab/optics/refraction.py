@@ -19,8 +19,6 @@ is that of the group velocity, and near infrared is soon absorbed.) - `paraxial`
 the surface at every angle, the textbook rule; for comparison.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 

@@ -6,8 +6,6 @@ same rules, and `liex compare` finds ids that differ only by an occasion. An amb
 whole: cutting too much would merge two animals.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 import unicodedata

@@ -19,8 +19,6 @@ depths (`16zT`). OpenNI's decoder is the reference.
 Slow twins: tests/oracles/oni.py and lzf.py.
 """
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -10,8 +10,6 @@ Depth is float32, measured along the optical axis (z of the camera frame, not ra
 0 means no reading. On writing, steps are exact or nearest.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace

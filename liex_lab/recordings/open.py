@@ -5,8 +5,6 @@ archive by `liex pack`, is also recognised by its first bytes. A reader's module
 are imported on demand.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path

@@ -9,8 +9,6 @@ point, is moved to its true position and splatted forward with a z-buffer into a
 the real one (`Water.without`); small holes are then closed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -5,8 +5,6 @@ greeting (length as u32, then name and camera); each frame follows as index and 
 height and width (u32), little endian, then H * W float32 mm, row by row.
 """
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

@@ -7,8 +7,6 @@ subsequence of t[i] - i is used. Lasting backward jumps of the clock are removed
 step of more than 1.5 median steps. Every moved stamp is reported.
 """
 
-from __future__ import annotations
-
 import re
 from bisect import bisect_right
 from contextlib import suppress

@@ -5,8 +5,6 @@ Its `notes` then report what a reader of the file should know. Depth is stored i
 `step_mm`, either exactly or rounded to the nearest step.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from abc import ABC, abstractmethod

@@ -6,8 +6,6 @@ after a power cut. New content is therefore synchronised before the rename, and 
 removed only when the rename is on disk.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

@@ -5,8 +5,6 @@ either, as in a container or for a service account. Cached code is executed, so 
 TMPDIR is used only if this account owns it and nobody else can write to it.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import stat

@@ -1,7 +1,5 @@
 """The decorators of all numba kernels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from numba import njit

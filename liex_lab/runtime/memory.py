@@ -4,8 +4,6 @@ With arrays on disk, hours of recording take no more memory than minutes. Code t
 columns iterates with `blocks`, which releases the pages of all arrays on disk after each block.
 """
 
-from __future__ import annotations
-
 import errno
 import math
 import mmap

@@ -5,8 +5,6 @@ it into a single file name that is valid on every file system and stays in its f
 of an output folder are not trusted: symbolic links are refused and never written through.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

@@ -5,8 +5,6 @@ kernel or a library's thread does not stop, the process exits after 4 s; a secon
 once. The disk is then in the same state as after a kill, which all writers handle.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -4,8 +4,6 @@ A job calls it with the number of completed pieces, the total, and a description
 shows it to the user.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -5,8 +5,6 @@ error. Callers that pass arrays to a kernel check them here, or pass a record th
 it was created.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import Any, ClassVar, Self

@@ -9,8 +9,6 @@
   weights w = 1 / (1 + (r / s)^2)^2.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -13,8 +13,6 @@ none. The blocks of one surface are also listed (`SurfaceBlocks`), as most of an
 none.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

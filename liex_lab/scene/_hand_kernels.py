@@ -8,8 +8,6 @@ length (185 mm) behind the fingertips. All lengths are those of a home-sized han
 blocks and labels are those of `_geodesic_kernels`.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -7,8 +7,6 @@ height map. In camera view, objects that merely overlap the animal in the image 
 largest gap in depth.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

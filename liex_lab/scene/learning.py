@@ -5,8 +5,6 @@ the sample (`worn`); the animal is the component that recurs in the most frames,
 rest that was absorbed into the background (`objects.find_resting_animal`).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -8,8 +8,6 @@ supports most of them. If nothing moves, a walled ground that lies above the lar
 and flagged as doubtful.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ moment. Any later bytes are truncated before the work resumes. Rerun cannot appe
 resumed run writes resumed.rrd, whose messages are appended to session.rrd later.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -5,8 +5,6 @@ pinhole camera at the depth read there), and words are checked against the ethog
 Times are assumed to have three decimals. Used by `liex correct` and by the dashboard.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 import shlex

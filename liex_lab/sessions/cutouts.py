@@ -21,8 +21,6 @@ sides of 1, 1.15 and 1.4 times that (animals rear and swim above the floor), and
 cut-out is centred in the smallest window that contains it, in front of the still scene.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path

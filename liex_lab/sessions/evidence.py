@@ -5,8 +5,6 @@ every frame, before association and smoothing, with their animal and camera; aft
 track is recomputed from them.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence

@@ -6,8 +6,6 @@ from before a study's run of it failed. A copy with corrections that no later se
 never removed, but numbered: NAME.outdated-2, NAME.outdated-3 and so on.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 import shutil

@@ -7,8 +7,6 @@ scene behind cut-outs in the previous image, some 50 images per chunk. Depth is 
 small is written at the end from the same track as the tables.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import struct

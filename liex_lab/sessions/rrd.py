@@ -4,8 +4,6 @@ Lengths are metres, the arena is right-handed with z up. Depth is streamed (see 
 everything small is written at the end from the same track as the tables.
 """
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import threading

@@ -1,7 +1,5 @@
 """Rerun viewer: starting it, opening a session's replay, and live streaming."""
 
-from __future__ import annotations
-
 import atexit
 import os
 import signal

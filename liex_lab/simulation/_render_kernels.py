@@ -6,8 +6,6 @@ centre. `draw_windows` makes training patches with their learned background, `dr
 depth images, `draw_hands` images and patches of hands.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

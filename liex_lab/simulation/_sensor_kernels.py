@@ -13,8 +13,6 @@ NOTHING, STILL (background), ANIMAL, OBJECT; `p`: one row (N_PARAMETERS,) of sen
 indexed as below.
 """
 
-from __future__ import annotations
-
 from statistics import NormalDist
 
 import numpy as np

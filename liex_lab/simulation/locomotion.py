@@ -8,8 +8,6 @@ decays as exp(-t / 0.35 s) between bouts, bends begin in front and a wave runs f
 while it scoots, glides, turns, rises, dives and rests.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -14,8 +14,6 @@ AR(1) process down every chain (correlation 0.75 with the parent's), and its qua
 joint's position between its limits (`draw_angles`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

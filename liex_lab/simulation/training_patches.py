@@ -10,8 +10,6 @@ The floor is stored as inverse depth, 1 / z = a u + b v + c, which is linear in 
 a plane in a pinhole image.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ with 3 degrees of freedom: erf(x / sqrt(2)) - sqrt(2 / π) x exp(-x^2 / 2), x = 
 are described in `schema`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property

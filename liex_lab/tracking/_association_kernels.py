@@ -10,8 +10,6 @@ beam keeps the best last links (Viterbi 1967). Transition cost between joints: d
 or exchanged, and gives the flip posterior.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -9,8 +9,6 @@ states (Rabiner 1989) then distinguishes head and tail on that path, and gives t
 Lie-X has no such step: its tracker is a particle filter (section 4.2).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

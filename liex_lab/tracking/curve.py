@@ -20,8 +20,6 @@ For an ongoing recording, `OnlineTracker` uses the same methods over a sliding w
 (fixed-lag smoothing), with earlier decisions fixed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

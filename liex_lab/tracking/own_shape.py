@@ -11,8 +11,6 @@ A stated shape, as shared by the sessions of one animal, is used unchanged, and 
 with the depth of all frames that show the animal well.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

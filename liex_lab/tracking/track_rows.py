@@ -5,8 +5,6 @@ its depth image contradicts it, and hidden if the animal is behind an object. It
 the curve plus the systematic error of a body of a different build or size.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -11,8 +11,6 @@ The limits were set on virtual recordings of the mouse, the fish and the hand wi
 `docs/trust.md` describes how.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 

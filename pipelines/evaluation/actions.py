@@ -14,8 +14,6 @@ it, and scores two recognisers on individuals that neither was trained on:
   check of `liex run`.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Sequence

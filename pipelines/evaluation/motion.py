@@ -14,8 +14,6 @@ to the fourth, and from the first to the fourth, and h from the fourth to the fi
 `MOTION_PROTOCOL` defines every number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -10,8 +10,6 @@ The published results are also scored on exactly the frames that ours were measu
 mean over 8,252 frames and one over a few are not comparable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -10,8 +10,6 @@ or development. `liex evaluate sizes` repeats `clean` over animals of several le
 evaluate reference` compares a session with another program's centroid and axis.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

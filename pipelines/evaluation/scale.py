@@ -9,8 +9,6 @@ restricted to as many cores); peak memory, MB, by length; and whole runs by kind
 report.
 """
 
-from __future__ import annotations
-
 import heapq
 import json
 import os

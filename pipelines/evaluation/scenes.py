@@ -6,8 +6,6 @@ scores them. Development uses seeds of its own; the sealed split uses others, wh
 test and no development.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tempfile
 from collections.abc import Callable, Sequence

@@ -7,8 +7,6 @@ test with sessions as units; 95 % intervals that contain the true difference; us
 model; and the power at an effect in standard deviations between animals.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

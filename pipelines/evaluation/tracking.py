@@ -21,8 +21,6 @@ the tracker's own search (seeds 101 to 108), none of which is reported; `Process
 result.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace

@@ -5,8 +5,6 @@ Names of animals and sessions come from the recordings' metadata, BIDS-like fold
 listed once.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

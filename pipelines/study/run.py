@@ -5,8 +5,6 @@ If sessions of one animal share size and shape, these are estimated first (`shar
 A lock in the study's cohort folder prevents a second run.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager

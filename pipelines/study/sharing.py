@@ -7,8 +7,6 @@ measures it or in which order. A session that cannot be inspected, or does not s
 its own values; so do all if their lengths differ too much.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence

@@ -4,8 +4,6 @@ No state is kept: a session is done while versions, plan, model and input in its
 current.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

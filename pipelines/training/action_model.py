@@ -7,8 +7,6 @@ our tables, from CSV, from BORIS projects and from BORIS's exports. `suggest` is
 sampling: it ranks the segments to label next by the entropy of the recogniser's actions.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

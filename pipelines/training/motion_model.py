@@ -17,8 +17,6 @@ frame by frame. These fits follow on the observations:
 Everything starts from fixed seeds, so `tunings.toml` is byte-identical on every run.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product

@@ -12,8 +12,6 @@ seeds and BLAS runs on one thread, so training is deterministic. `Recipe` states
 images; `RECIPES` and `_OWN` have one for each animal and variant.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -8,8 +8,6 @@ trained on, estimates the remaining error of the joints. Everything is drawn fro
 is deterministic.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Channels are seconds and body lengths whatever the camera's rate, and gaps part them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

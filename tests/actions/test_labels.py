@@ -1,7 +1,5 @@
 """Cohen's kappa against published numbers, scikit-learn, and its own interval against samples."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 without pickle.
 """
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from copy import deepcopy

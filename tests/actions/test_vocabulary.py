@@ -1,7 +1,5 @@
 """The printed definition of a word and the check of its bouts come from the same limits."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

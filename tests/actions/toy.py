@@ -1,7 +1,5 @@
 """Tracks made of formulas: a mouse or a fish that goes and stays by turns."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cache

@@ -2,8 +2,6 @@
 them.
 """
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 
 import numpy as np

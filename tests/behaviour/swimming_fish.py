@@ -2,8 +2,6 @@
 functions of time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rearing is counted, pauses and runs are told apart, and no bout crosses a gap."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

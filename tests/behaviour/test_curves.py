@@ -1,7 +1,5 @@
 """What is drawn and measured of a body follows from its joints, not from being a mouse."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

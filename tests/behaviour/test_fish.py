@@ -1,7 +1,5 @@
 """Stories of a fish whose circle, dive and tail's beat are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """Stories of a mouse whose speed, heading and heights are known."""
 
-from __future__ import annotations
-
 from importlib import import_module
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Groups are compared by the unit that the design has, and refused where it has none."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from typing import Any
 

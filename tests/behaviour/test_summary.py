@@ -1,7 +1,5 @@
 """The row a biologist reads first adds up."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

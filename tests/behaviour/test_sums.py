@@ -1,7 +1,5 @@
 """Transitions against chance, zones, walls, activity, latencies: stories with known answers."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

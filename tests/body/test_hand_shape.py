@@ -1,7 +1,5 @@
 """Hands of many people: their own bones, their own girth, and an arm behind them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Poses that keep the frames of their joints give what forward kinematics gives, run once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The renderer against a ray through every pixel, and the laws a picture obeys."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 name the mistake.
 """
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A body as balls: they lie along its bones, are as thick as it is, and move with it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 shapes.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

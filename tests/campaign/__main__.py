@@ -6,8 +6,6 @@ tracebacks, slowest_s) one after the other and writes the file after each; with 
 of each, for a night.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

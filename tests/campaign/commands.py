@@ -1,7 +1,5 @@
 """The program as its users start it, and how it ended."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

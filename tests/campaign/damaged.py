@@ -4,8 +4,6 @@ Each file is read in a process that may grow by little memory and has little tim
 dies is a fault of its own.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import shutil
 import tempfile

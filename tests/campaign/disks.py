@@ -1,7 +1,5 @@
 """A disk that is full after 1 to 90 per cent of what a verb writes, for every verb that writes."""
 
-from __future__ import annotations
-
 import random
 import re
 import shutil

@@ -1,7 +1,5 @@
 """A drive that cannot be read, a clock that jumps, two runs on one folder at once."""
 
-from __future__ import annotations
-
 import random
 import shutil
 import tempfile

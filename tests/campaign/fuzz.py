@@ -2,8 +2,6 @@
 hunt goes on.
 """
 
-from __future__ import annotations
-
 import functools
 import inspect
 import random

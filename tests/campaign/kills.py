@@ -1,7 +1,5 @@
 """SIGKILL of the main process at random moments."""
 
-from __future__ import annotations
-
 import json
 import random
 import shutil

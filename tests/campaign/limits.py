@@ -1,7 +1,5 @@
 """Runs that the system gives little: memory, open files, places to write."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Iterator

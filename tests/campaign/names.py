@@ -1,7 +1,5 @@
 """Hostile names and links against everything that writes: the laws of `test_hostile_writers`."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -5,8 +5,6 @@ is flagged as trusted must be right, or the run must say what to distrust: in a 
 code, or in the note of its last line.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import threading

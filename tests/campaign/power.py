@@ -4,8 +4,6 @@ What the program has written but not synced is in memory only, and not in the sn
 system (ext4) puts itself right from its journal when the snapshot is mounted.
 """
 
-from __future__ import annotations
-
 import random
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Runs in processes of their own that may be killed, and what has to be equal afterwards."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

@@ -1,7 +1,5 @@
 """Ctrl-C, SIGTERM and SIGHUP at random moments of runs and studies."""
 
-from __future__ import annotations
-
 import random
 import shutil
 import signal

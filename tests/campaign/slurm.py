@@ -4,8 +4,6 @@ jobs, node and submitting process are killed, held up and started again.
 It wants root and `apt-get install slurmctld slurmd slurm-client munge`; else it says so.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

@@ -1,7 +1,5 @@
 """Disks of a campaign's own, mounted for a while."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Studies whose workers are killed, and a study of a hundred sessions of which ten are broken."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """What became of the faults of a campaign, counted alike for all of them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any

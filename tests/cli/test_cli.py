@@ -2,8 +2,6 @@
 JSON that is JSON.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

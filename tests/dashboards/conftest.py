@@ -2,8 +2,6 @@
 request to another machine is kept.
 """
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterator

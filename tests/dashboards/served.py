@@ -1,7 +1,5 @@
 """A dashboard that answers on this machine, and what was asked of it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Sequence

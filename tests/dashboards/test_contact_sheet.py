@@ -2,8 +2,6 @@
 and every mark where the camera sees its object.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import re

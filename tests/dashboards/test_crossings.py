@@ -1,7 +1,5 @@
 """Crossings: where head and tail, or two animals, were or may have been taken for one another."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

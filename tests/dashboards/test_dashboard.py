@@ -2,8 +2,6 @@
 everybody may ask.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import shutil

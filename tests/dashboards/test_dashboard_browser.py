@@ -1,7 +1,5 @@
 """The dashboard in a real browser, one story per page: what is clicked happens, nothing else."""
 
-from __future__ import annotations
-
 import csv
 import re
 import time

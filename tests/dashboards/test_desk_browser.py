@@ -2,8 +2,6 @@
 exchanged, playing, taking back, doubtful places and crossings one after the other.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Figures say what the tables say: times, lengths, and every n."""
 
-from __future__ import annotations
-
 import re
 from contextlib import closing
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the Methods paragraph says of names, speed and length agrees with the tables."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A region drawn over the depth picture in a real browser, and the plan that then states it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect

@@ -1,7 +1,5 @@
 """The replay as a picture: what Rerun's own viewer, without a screen, draws at two moments."""
 
-from __future__ import annotations
-
 import ctypes.util
 import importlib.util
 import os

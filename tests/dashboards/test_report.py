@@ -1,7 +1,5 @@
 """The report is one file that needs nothing else, and says what the session says."""
 
-from __future__ import annotations
-
 import re
 import tarfile
 from html import escape

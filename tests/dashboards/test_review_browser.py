@@ -2,8 +2,6 @@
 the agreement at the end.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The queue of corrections: many at a time, in order, each with its number, none lost."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Sequence
 from pathlib import Path

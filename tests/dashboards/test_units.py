@@ -1,7 +1,5 @@
 """People read cm/s, degrees and whole words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

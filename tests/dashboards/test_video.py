@@ -1,7 +1,5 @@
 """A video shows the session at its own times, and says in a sentence where it cannot."""
 
-from __future__ import annotations
-
 import shutil
 from contextlib import closing
 from pathlib import Path

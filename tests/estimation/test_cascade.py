@@ -1,7 +1,5 @@
 """Labels: the correction that a forest learns is the one that, applied, leads to the truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The bundled hand: somebody's gestures before a camera, from the pictures alone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.estimation.estimator import PoseEstimator

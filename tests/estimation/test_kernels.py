@@ -1,7 +1,5 @@
 """What a candidate sees is what the camera sees, and corrections are the group's own products."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

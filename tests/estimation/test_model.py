@@ -2,8 +2,6 @@
 refused in a sentence.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

@@ -2,8 +2,6 @@
 that.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.interpolate import interp1d

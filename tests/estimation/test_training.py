@@ -1,7 +1,5 @@
 """Training: forests that see a toy world learn to measure in it, and to say how well they do."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

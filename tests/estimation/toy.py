@@ -4,8 +4,6 @@ known exactly.
 The product's own foreground cuts the height maps, so a toy set is what training sees, only smaller.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass, replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Scores against truth agree with what a reader works out by hand."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ empty module. `python boris_reader.py PROJECT` prints
 `{"changed", "message", "faults", "media", "observations"}`.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import json

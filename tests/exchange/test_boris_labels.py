@@ -1,7 +1,5 @@
 """State events of BORIS are labels, and events that make no bout are told."""
 
-from __future__ import annotations
-
 import gzip
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """BORIS's own reader opens our projects and finds nothing wrong; collected where it is there."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """DANDI's own program takes our NWB files; collected where it is installed. It needs no network."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

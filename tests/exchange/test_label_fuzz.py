@@ -1,7 +1,5 @@
 """Whatever is in a file of labels, it is read or refused in one sentence."""
 
-from __future__ import annotations
-
 import copy
 import gzip
 import json

@@ -1,7 +1,5 @@
 """An NWB file holds the session's own poses, actions and animal, and archives would take it."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """movement's and SLEAP's own readers open what we write; collected where both are installed."""
 
-from __future__ import annotations
-
 import numpy as np
 import sleap_io
 import xarray

@@ -1,7 +1,5 @@
 """Boosted forests: trees that correct one another, read as every forest is read, by their mean."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

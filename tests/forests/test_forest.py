@@ -2,8 +2,6 @@
 repeatable.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numba

@@ -1,7 +1,5 @@
 """What hypothesis draws for rigid motion."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray

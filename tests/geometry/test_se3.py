@@ -1,7 +1,5 @@
 """Rigid transforms are a group, and the formulas of Lie-X section 3 hold in it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

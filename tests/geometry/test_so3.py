@@ -1,7 +1,5 @@
 """Rotations: exp and log undo one another to 1e-9 everywhere, near 0 and near pi too."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

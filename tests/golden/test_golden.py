@@ -1,7 +1,5 @@
 """Sessions that older versions wrote stay readable: every table, every column, every value."""
 
-from __future__ import annotations
-
 import json
 import tarfile
 from pathlib import Path

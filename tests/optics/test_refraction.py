@@ -1,7 +1,5 @@
 """Through the water: known points are seen as Snell's law says, and put back where they are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The semi-Markov chain of actions by looking at every possible way through its states."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

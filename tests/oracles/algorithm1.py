@@ -6,8 +6,6 @@ camera, and an offset's way over the map is a finite difference of that. Only th
 is shared with `oracles.forest`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import erf
 

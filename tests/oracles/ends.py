@@ -2,8 +2,6 @@
 back by so much.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.scene._blob_kernels import BLOCK

@@ -2,8 +2,6 @@
 pixel by pixel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.body.shape import Spheres

@@ -2,8 +2,6 @@
 zero.
 """
 
-from __future__ import annotations
-
 
 def remainder(data: bytes) -> int:
     """What is left of the data, 0 for a slice that holds its own check sum."""

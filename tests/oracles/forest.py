@@ -1,7 +1,5 @@
 """A tree the way a reader would walk it: bytes unpacked by hand, one sample at a time."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

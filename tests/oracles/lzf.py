@@ -1,7 +1,5 @@
 """LZF unpacked one byte at a time, as a reader of its description would."""
 
-from __future__ import annotations
-
 
 def unpack_lzf(packed: bytes) -> bytes:
     """The bytes that were packed; IndexError where the data are cut, ValueError where they point

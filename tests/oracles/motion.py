@@ -1,7 +1,5 @@
 """Rigid motion the slow way: 4x4 matrices, SciPy's matrix exponential, and loops."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm

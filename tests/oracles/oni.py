@@ -2,8 +2,6 @@
 tested against.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -2,8 +2,6 @@
 through water.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

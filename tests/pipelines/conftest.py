@@ -1,7 +1,5 @@
 """One recording of a walking mouse, and its session, for every test that needs a measured one."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

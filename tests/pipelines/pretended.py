@@ -2,8 +2,6 @@
 recording's name asks for.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 import os

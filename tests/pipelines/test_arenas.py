@@ -1,7 +1,5 @@
 """Several arenas in one picture: each is the session that a run of its own would have made."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """From a plan to objects: the recording as the plan says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -2,8 +2,6 @@
 which hand it is.
 """
 
-from __future__ import annotations
-
 import gc
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sessions on disk are compared by group, and what cannot be is told."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

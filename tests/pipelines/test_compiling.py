@@ -1,7 +1,5 @@
 """Kernels compiled ahead: the list is true, and a machine does it once."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import subprocess

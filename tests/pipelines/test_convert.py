@@ -1,7 +1,5 @@
 """`liex convert`: the same recording in another format, or nothing at all."""
 
-from __future__ import annotations
-
 import hashlib
 import resource
 import signal

@@ -1,7 +1,5 @@
 """`liex doctor`: the facts of a recording, and what is wrong with it."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

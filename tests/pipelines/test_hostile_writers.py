@@ -2,8 +2,6 @@
 folder that the user named stays as it is.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Frames that are still to come: through a socket, and out of a folder that grows."""
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

@@ -1,7 +1,5 @@
 """Two stretches are looked at side by side: the same is told, in the same order, and errors too."""
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import closing

@@ -1,7 +1,5 @@
 """A recording in, a session out, whose every frame is accounted for and near the truth."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The region of an arena in a study's plans, or beside a session: stated, changed, taken out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scene behind the replay's cut-outs holds no animal, also where one hardly ever moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

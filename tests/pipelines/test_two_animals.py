@@ -1,7 +1,5 @@
 """Two animals in one arena: run, report and study say so, and the report shows the second one."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

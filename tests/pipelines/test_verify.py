@@ -1,7 +1,5 @@
 """`liex verify` believes a session that is what it was, and says what is not."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """One value put into a TOML file that a person wrote: all else stays, to the letter."""
 
-from __future__ import annotations
-
 import random
 import tomllib
 from typing import Any

@@ -2,8 +2,6 @@
 kept here.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

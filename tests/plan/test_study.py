@@ -1,7 +1,5 @@
 """A study file names what is in its own folder, and says in one sentence what is wrong with it."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The animal of a recording is found whatever day, session or date stands beside it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Opening what may not be a recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

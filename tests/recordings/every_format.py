@@ -5,8 +5,6 @@ An entry writes given frames and says which of them must come out whole when a f
 laws are in test_laws.py, the damage in test_damage.py.
 """
 
-from __future__ import annotations
-
 import struct
 import tarfile
 import zlib

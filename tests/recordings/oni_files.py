@@ -1,7 +1,5 @@
 """Putting .oni files together by hand, record by record, as old and odd programs wrote them."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 from collections.abc import Sequence

@@ -6,8 +6,6 @@ Dummy device or of what its player plays. Run as a script, this module does eith
 without taking anything down.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import subprocess

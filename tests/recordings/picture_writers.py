@@ -2,8 +2,6 @@
 and stamps in it.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

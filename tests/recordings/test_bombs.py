@@ -2,8 +2,6 @@
 little time and memory.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -2,8 +2,6 @@
 before the damage.
 """
 
-from __future__ import annotations
-
 import resource
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Frames that lie side by side are stacked without a copy, and their room is used again."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.recordings.frame import DepthFrame, FrameRooms, has_readings, stacked

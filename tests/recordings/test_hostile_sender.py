@@ -1,7 +1,5 @@
 """Whoever sends frames may lie about them: that is a sentence, in bounded time and memory."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Infrared looks like depth to a reader of 16-bit images: no container lets it pass for depth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path

@@ -2,8 +2,6 @@
 formats.py.
 """
 
-from __future__ import annotations
-
 import gc
 import io
 import os

@@ -2,8 +2,6 @@
 test_laws.py.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import subprocess
@@ -335,7 +333,7 @@ def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     genuine = Path.open
 
     class Full:
-        def __enter__(self) -> Full:
+        def __enter__(self) -> "Full":
             return self
 
         def __exit__(self, *_: object) -> None: ...

@@ -2,8 +2,6 @@
 recording stays.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The fast RVL encoder against the slow decoder."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

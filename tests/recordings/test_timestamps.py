@@ -1,7 +1,5 @@
 """Time stamps: exact, strictly increasing, and honest about what was not."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What the writers write, their own readers and other people's read again."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -2,8 +2,6 @@
 wrote.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Mapping, Sequence

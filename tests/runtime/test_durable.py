@@ -1,7 +1,5 @@
 """A folder takes the place of another: on disk first, and one of the two always whole."""
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil

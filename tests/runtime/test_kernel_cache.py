@@ -1,7 +1,5 @@
 """Kernels have a place wherever liex starts, and none that somebody else could have filled."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -2,8 +2,6 @@
 told beforehand.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

@@ -1,7 +1,5 @@
 """A name that came out of a file is one name in the folder that the user named, or is refused."""
 
-from __future__ import annotations
-
 import io
 import os
 from pathlib import Path

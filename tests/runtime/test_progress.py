@@ -1,7 +1,5 @@
 """What a person who waits is told."""
 
-from __future__ import annotations
-
 from numba.core import event
 
 from liex_lab.runtime.progress import COMPILING, telling_of_compiling

@@ -1,7 +1,5 @@
 """Arrays are checked at the door: what fits passes, and what does not is told in a sentence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -2,8 +2,6 @@
 and leaves no other process behind.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

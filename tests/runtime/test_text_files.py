@@ -1,7 +1,5 @@
 """Texts that a person may have saved with any editor are read alike, or refused with the cause."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is made ahead by a thread is what would have been made in turn."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Small stages for stories about scenes: an arena anywhere, and a mouse that walks in it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """A sensor that warms up changes nothing that is measured, and a still one is not touched."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

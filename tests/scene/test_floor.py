@@ -1,7 +1,5 @@
 """What is said of a camera's place above the floor."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -2,8 +2,6 @@
 line of sight.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

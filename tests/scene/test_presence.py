@@ -1,7 +1,5 @@
 """Animals that come late, leave or sleep are found; an empty arena holds no animal."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The scene as a noun: stated in a plan or found, written down, and refused in one sentence."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The floor is where animals stand, however small and however high it lies."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

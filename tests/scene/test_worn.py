@@ -1,7 +1,5 @@
 """Cables are cut out of pictures, and what wears none is not touched."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.optics.camera import Camera

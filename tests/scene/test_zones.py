@@ -1,7 +1,5 @@
 """Zones that a person has drawn: points are in them or not, and a slip is told in one sentence."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

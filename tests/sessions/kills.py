@@ -2,8 +2,6 @@
 neither renames, removes nor synchronises anything.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

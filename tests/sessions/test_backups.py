@@ -1,7 +1,5 @@
 """Writers that are killed while a session takes the place of another one: corrections stay."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Long tables are made, written and read in blocks: whatever their size, the same rows come out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

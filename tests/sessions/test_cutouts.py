@@ -1,7 +1,5 @@
 """What a session keeps of its depth: cut-outs before the still scene, in both replays."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """A session that the disk has by far no room for is refused before its first frame."""
 
-from __future__ import annotations
-
 import shutil
 from collections import namedtuple
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A session of another lab is data: what does not fit is told in a sentence that names the file."""
 
-from __future__ import annotations
-
 import copy
 import json
 import shutil

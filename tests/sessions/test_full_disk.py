@@ -4,8 +4,6 @@ a checkpoint was made of.
 A limit on the size of files stands for the full disk: it needs no account of its own.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import resource

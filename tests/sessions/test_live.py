@@ -1,7 +1,5 @@
 """A stream of skeletons: what is in it, and what is said where no window can be shown."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

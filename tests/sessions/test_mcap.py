@@ -1,7 +1,5 @@
 """The MCAP file reads back through the format's own reader, depth exactly."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 

@@ -1,7 +1,5 @@
 """Our MCAP files are what the format's own library reads, whole or cut after any flush."""
 
-from __future__ import annotations
-
 import io
 from collections import Counter
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Reviews: drawn and shuffled by a seed, kept with every answer, read back or refused in words."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

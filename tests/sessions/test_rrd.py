@@ -1,7 +1,5 @@
 """The replay holds what the tables say, on both timelines."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

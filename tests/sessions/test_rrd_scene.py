@@ -1,7 +1,5 @@
 """What stands still and where the animal hid are drawn in the replay."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

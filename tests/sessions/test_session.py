@@ -1,7 +1,5 @@
 """A session is whole or it is not there; what was written can be read back."""
 
-from __future__ import annotations
-
 import errno
 import json
 import re

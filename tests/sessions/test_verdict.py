@@ -1,7 +1,5 @@
 """The verdict on a session: what was measured, what is to be distrusted, and when to look at it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small blocks of training patches, and the user's own animals, for all tests of the simulation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

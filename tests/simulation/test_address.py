@@ -1,7 +1,5 @@
 """Virtual recordings by address, through the one door."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

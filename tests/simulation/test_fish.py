@@ -1,7 +1,5 @@
 """The fish: what real ones do it can do, too, and it hangs anywhere in the water."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

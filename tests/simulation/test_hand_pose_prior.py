@@ -1,7 +1,5 @@
 """Hand postures: statistics that can be drawn from, and what their drawing keeps."""
 
-from __future__ import annotations
-
 import tomllib
 
 import numpy as np

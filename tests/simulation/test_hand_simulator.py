@@ -1,7 +1,5 @@
 """The world of the hand: pictures from a seed, with the truth in them."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

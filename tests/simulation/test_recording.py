@@ -1,7 +1,5 @@
 """Synthetic recordings: the truth is exact, the same seed gives the same depth images."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Scenes: the same seed is the same picture, the truth lies in it, each scene is what it says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

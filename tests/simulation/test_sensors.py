@@ -1,7 +1,5 @@
 """Noise models of sensors: they err as the real ones do."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

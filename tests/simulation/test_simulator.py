@@ -2,8 +2,6 @@
 moves as it can.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

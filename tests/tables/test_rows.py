@@ -1,7 +1,5 @@
 """What becomes of a track: rotations, scores, gaps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

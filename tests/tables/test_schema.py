@@ -1,7 +1,5 @@
 """Every column is listed once, written as listed, and equal input gives equal bytes."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What single frames might say of a mouse that walks on a known curve."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from liex_lab.body.pose import Pose

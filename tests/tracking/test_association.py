@@ -1,7 +1,5 @@
 """The association: which hypotheses are the animal."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

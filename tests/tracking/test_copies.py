@@ -1,7 +1,5 @@
 """Depth images that repeat: asked for too often, a stream that froze, or an animal at rest."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Frames around a pose that a person placed follow it as the smoother's own measurements would."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hidden is a state: an animal that goes behind something is told from one that was not found."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Of two animals that differ in size, the one that leaves a meeting is the one that came to it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the tracker believes of an animal is a table that can be written again."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """An animal of which a beam hides one end is put where the end that is seen says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

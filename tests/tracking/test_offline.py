@@ -2,8 +2,6 @@
 longer.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A session's own shape: kept where frames that it was not fitted to bear it out, not elsewhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A clock that runs too fast is told by how far the animal goes, whatever else moves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What sessions of one animal agree on: a mean that no order of them changes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

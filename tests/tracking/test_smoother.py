@@ -1,7 +1,5 @@
 """The filter and its way back, against SciPy's matrices and against a dense least-squares twin."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.linalg import expm

@@ -1,7 +1,5 @@
 """A track: one row for every frame, measured or not, and parts that join into the whole."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

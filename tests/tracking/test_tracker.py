@@ -1,7 +1,5 @@
 """The frame tracker: every frame of a recording becomes a row, whatever is in it."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 
 import numpy as np

@@ -2,8 +2,6 @@
 animal is in view no pose is made up elsewhere.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

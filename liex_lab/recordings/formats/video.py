@@ -7,8 +7,6 @@ order decodes each once, random access decodes some more. AVI has a constant rat
 In Matroska a frame's time is (cluster time + block time) * timecode scale.
 """
 
-from __future__ import annotations
-
 import struct
 from array import array
 from contextlib import suppress

@@ -7,8 +7,6 @@ lengths per second. `agents.agent` filters and concatenates the actions, `fish_p
 body.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

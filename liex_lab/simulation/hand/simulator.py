@@ -6,8 +6,6 @@ postures come from another person's labelled frames of the NYU Hand Pose data se
 2014) if that reference is available.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The scenes by name: mice from a recipe, a fish in a small tank, a hand, and a mirrored hand."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType

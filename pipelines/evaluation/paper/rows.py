@@ -9,8 +9,6 @@ variant and the baselines would make, is. A component is another object if its c
 from the middle of the true joints than 0.8 spines. All numbers are mm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter

@@ -1,7 +1,5 @@
 """What `liex evaluate actions` says of bouts that contradict their printed definitions."""
 
-from __future__ import annotations
-
 from liex_lab.pipelines.evaluation.actions import contradictions
 
 from tests.actions.toy import going_and_staying, taught_to_lie

@@ -1,7 +1,5 @@
 """`liex evaluate motion`: a real mouse's points beside the virtual mouse."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The NYU protocol: published figures to the last digit, and what it means to be given the root."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

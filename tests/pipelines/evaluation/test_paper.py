@@ -2,8 +2,6 @@
 the numbers.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Benchmarks of recording formats: every number is there and means what it says."""
 
-from __future__ import annotations
-
 import json
 import time
 from importlib import import_module

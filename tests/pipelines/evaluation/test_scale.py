@@ -2,8 +2,6 @@
 long.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from liex_lab.pipelines.evaluation.scale import evaluate_report, repeat_session, simulate

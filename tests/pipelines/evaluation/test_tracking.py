@@ -2,8 +2,6 @@
 picture of it.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from itertools import pairwise
 from unittest.mock import patch

@@ -1,7 +1,5 @@
 """A study whose worker processes are gone for good ends in a sentence and waits for nobody."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

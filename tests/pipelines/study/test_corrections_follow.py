@@ -1,7 +1,5 @@
 """A session that people corrected fails, is done, fails again: the corrections follow it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A cluster tells nobody what it does, and its end is a sentence."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

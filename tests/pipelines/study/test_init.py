@@ -1,7 +1,5 @@
 """`liex cohort init`: a study file that loads, whatever the folders and files are called."""
 
-from __future__ import annotations
-
 import json
 import tarfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Two short virtual recordings of one mouse of known length, measured as one animal."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

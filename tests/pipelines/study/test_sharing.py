@@ -1,7 +1,5 @@
 """Sessions of one animal share its size and shape, whoever looks at them and in whatever order."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from contextlib import contextmanager, nullcontext

@@ -1,7 +1,5 @@
 """Where a job of Slurm ends before the study does, another one is asked for, but not for ever."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace

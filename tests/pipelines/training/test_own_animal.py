@@ -1,7 +1,5 @@
 """An animal of the user's own, as docs/tutorials/own-animal.md has it: train, evaluate, run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

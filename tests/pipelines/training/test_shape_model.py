@@ -1,7 +1,5 @@
 """Shapes are learned from mini-sessions of known animals, the same whenever they are drawn."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -2,8 +2,6 @@
 bins of an image, the RealSense programs' text, packed messages, units, and orders of recording.
 """
 
-from __future__ import annotations
-
 import json
 import sqlite3
 import struct

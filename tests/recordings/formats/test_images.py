@@ -1,7 +1,5 @@
 """Folders of PNG and TIFF images."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """MCAP with Foxglove's messages, whole and cut."""
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

@@ -1,7 +1,5 @@
 """MoSeq sessions, whole and cut."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """The NYU layout: its images as a recording, its joints beside them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """PrimeSense recordings (.oni), in every form in which OpenNI's programs have written them."""
 
-from __future__ import annotations
-
 import math
 import struct
 import tracemalloc

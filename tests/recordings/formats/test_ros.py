@@ -1,7 +1,5 @@
 """Depth in ROS's messages: in MCAP files, in ROS 1 bags and in ROS 2 bags, which read alike."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from pathlib import Path

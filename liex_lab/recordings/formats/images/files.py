@@ -11,8 +11,6 @@ tifffile, and codecs that need an optional package of tifffile (LZW) by OpenCV. 
 first bad page, because later ones may be noise.
 """
 
-from __future__ import annotations
-
 import logging
 import lzma
 import re

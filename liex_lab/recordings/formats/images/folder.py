@@ -4,8 +4,6 @@ Images are read in natural order. Times come from a stamp file, or else from the
 images, or else from a stated constant rate.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -13,8 +13,6 @@ a chunk is checked against its CRC-32 when a frame in it is read. Any other file
 read, because single frames of a long recording are needed quickly.
 """
 
-from __future__ import annotations
-
 import itertools
 import struct
 import zlib

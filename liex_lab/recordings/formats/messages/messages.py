@@ -8,8 +8,6 @@ CompressedImage, PointCloud2 and CameraInfo (`parsers`); std_msgs/String, std_ms
 diagnostic_msgs/KeyValue for statements of the RealSense programs (`statements`).
 """
 
-from __future__ import annotations
-
 import bz2
 import re
 from abc import ABC, abstractmethod

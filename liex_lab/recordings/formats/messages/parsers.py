@@ -5,8 +5,6 @@ changed, so they are fixed here; ROS 1 serialisation and ROS 2 CDR have the same
 differ in alignment, in the header and in the zero at a string's end.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ recordings lack it; `rosbags`, the reference library in the tests, refuses such 
 header of named fields and data; a chunk packs records (none, bz2, lz4).
 """
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
