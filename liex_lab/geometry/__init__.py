@@ -3,6 +3,6 @@
 Twists are (omega, nu): radians, then millimetres.
 """
 
-from liex_lab.geometry.se3 import SE3, brownian_ends, brownian_path, brownian_steps
+from liex_lab.geometry.se3 import SE3, brownian_ends, brownian_steps
 
-__all__ = ["SE3", "brownian_ends", "brownian_path", "brownian_steps"]
+__all__ = ["SE3", "brownian_ends", "brownian_steps"]

@@ -139,27 +139,6 @@ class SE3(Rows):
         return SE3(rotation, self.translation + step * (other.translation - self.translation))
 
 
-def product_of_exponentials(twists: ArrayLike) -> SE3:
-    """All partial products exp(xi_1) ... exp(xi_j) of a chain of twists.
-
-    Args:
-        twists: (..., J, 6) rad and mm.
-
-    Returns:
-        A batch (..., J).
-    """
-    links = SE3.exp(twists)
-    products = [SE3.identity(*links.translation.shape[:-2])]
-    for j in range(links.translation.shape[-2]):
-        products.append(
-            products[-1] @ SE3(links.rotation[..., j, :, :], links.translation[..., j, :])
-        )
-    return SE3(
-        np.stack([product.rotation for product in products[1:]], axis=-3),
-        np.stack([product.translation for product in products[1:]], axis=-2),
-    )
-
-
 # Left-invariant Brownian motion on SE(3) (Lie-X Eq. 6 and 7).
 
 
@@ -179,36 +158,6 @@ def brownian_steps(
     """
     return rng.multivariate_normal(
         np.zeros(6), np.asarray(covariance, float), size=(*batch, n_steps)
-    )
-
-
-def brownian_path(start: SE3, steps: ArrayLike, delta: float, times: ArrayLike) -> SE3:
-    """The path g(t) from `start` at given times, by Lie-X Eq. 6 and 7.
-
-    Args:
-        start: one element, g(0).
-        steps: (n_steps, 6) tangent steps z.
-        delta: step length, s.
-        times: (n,) s, in [0, n_steps * delta].
-
-    Returns:
-        A batch (n,).
-
-    Raises:
-        ValueError: a time outside the path, or a delta that is not positive.
-    """
-    z = np.asarray(steps, float)
-    t = np.atleast_1d(np.asarray(times, float))
-    if not delta > 0 or t.min() < 0 or t.max() > len(z) * delta * (1 + 1e-12):
-        raise ValueError(
-            f"times must lie within the path, 0 to {len(z) * delta} s, got {t.min()} to {t.max()} s"
-        )
-    nodes = product_of_exponentials(np.sqrt(delta) * np.concatenate([np.zeros((1, 6)), z]))
-    before = np.minimum((t / delta).astype(int), len(z) - 1)
-    return (
-        start
-        @ nodes[before]
-        @ SE3.exp(((t - before * delta) / np.sqrt(delta))[:, None] * z[before])
     )
 
 

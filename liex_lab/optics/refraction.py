@@ -31,7 +31,6 @@ from liex_lab.optics.camera import Camera
 Array = NDArray[np.float64]
 
 RANGINGS = ("light_field", "structured_light", "time_of_flight", "paraxial")
-N_LAW = 10  # numbers per ray
 _STEEPEST = 0.05  # cosine between a ray and the perpendicular; flatter rays do not reach the water
 
 
@@ -106,7 +105,7 @@ class Water:
         )
 
     def law(self, rays: ArrayLike) -> Array:
-        """The effect of refraction on rays: `N_LAW` numbers for each.
+        """The effect of refraction on rays: ten numbers for each.
 
         (a, b, c, k, sx, sy, sz, bx, by, bz): a point reported at apparent depth z is d below the
         surface, where
@@ -121,7 +120,7 @@ class Water:
             rays: (..., 2), the x and y of (x, y, 1), camera frame.
 
         Returns:
-            (..., N_LAW).
+            (..., 10).
         """
         xy = np.asarray(rays, float)
         ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
@@ -191,30 +190,6 @@ class Water:
             across += (side[..., k] - slope * side[..., 2]) * side[..., k]
         share = cos_air / ray[..., 2] / len(axes)
         return within * share, across * share
-
-    def true_points(self, rays: ArrayLike, depth: ArrayLike) -> Array:
-        """True positions of points observed along rays at an apparent depth.
-
-        Args:
-            rays: (..., 2), the x and y of (x, y, 1), camera frame.
-            depth: (...) mm, as reported by the camera.
-
-        Returns:
-            (..., 3) mm, camera frame.
-        """
-        xy = np.asarray(rays, float)
-        z = np.asarray(depth, float)
-        law = self.law(xy)
-        excess = law[..., 3] * z - 1.0
-        wet = np.maximum(excess, 0.0)
-        b = law[..., 1] - law[..., 2] * z
-        below = 2.0 * wet / (b + np.sqrt(b * b + 4.0 * law[..., 0] * wet))
-        seeming = np.concatenate(
-            [xy * z[..., None], (z * np.ones(xy.shape[:-1]))[..., None]], axis=-1
-        )
-        return np.where(
-            (excess > 0)[..., None], law[..., 4:7] + below[..., None] * law[..., 7:10], seeming
-        )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json."""

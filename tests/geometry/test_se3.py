@@ -3,12 +3,9 @@
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 
-from liex_lab.geometry import SE3, so3
-from liex_lab.geometry.se3 import product_of_exponentials
+from liex_lab.geometry import SE3
 from tests.geometry.strategies import Array, twists
 from tests.oracles import motion
 
@@ -28,21 +25,10 @@ def test_transforms_are_a_group(a: Array, b: Array, c: Array) -> None:
     assert_same(g @ SE3.identity(), g)
     assert_same(g @ g.inverse(), SE3.identity())
     assert_same((g @ h).inverse(), h.inverse() @ g.inverse())
-
-
-@given(a=twists(), b=twists())
-def test_composition_is_the_product_of_matrices(a: Array, b: Array) -> None:
-    g, h = SE3.exp(a), SE3.exp(b)
     assert_close((g @ h).matrix, g.matrix @ h.matrix)
     assert_same(SE3.from_matrix(g.matrix), g)
-
-
-@given(a=twists(), b=twists(), p=st.tuples(*[st.floats(-500, 500)] * 3))
-def test_frames_cancel_on_points(a: Array, b: Array, p: tuple[float, float, float]) -> None:
-    T_world_camera, T_camera_body = SE3.exp(a), SE3.exp(b)
-    in_world = (T_world_camera @ T_camera_body) @ p
-    assert_close(T_world_camera @ (T_camera_body @ p), in_world)
-    assert_close((T_world_camera.matrix @ T_camera_body.matrix @ [*p, 1.0])[:3], in_world)
+    p = 500.0 * np.cos(c[:3])
+    assert_close((g @ h) @ p, (g.matrix @ h.matrix @ [*p, 1.0])[:3])
 
 
 @given(xi=twists())
@@ -57,17 +43,6 @@ def test_exp_and_log_undo_one_another(xi: Array) -> None:
     # near pi the two directions of turning meet, and log may come back by the other one
     if np.linalg.norm(xi[:3]) < np.pi - 1e-9:
         assert_close(g.log(), xi)
-
-
-@pytest.mark.parametrize("below_pi", [1e-12, 1e-9, 1e-6, 1e-4, 1e-3])
-def test_log_undoes_exp_near_pi(below_pi: float) -> None:
-    rng = np.random.default_rng(11)
-    for _ in range(20):
-        axis = rng.normal(size=3)
-        xi = np.concatenate(
-            [(np.pi - below_pi) * axis / np.linalg.norm(axis), rng.uniform(-50, 50, 3)]
-        )
-        assert_close(SE3.exp(xi).log(), xi)
 
 
 @given(a=twists(), b=twists())
@@ -91,20 +66,6 @@ def test_a_geodesic_joins_its_ends_at_constant_speed_on_the_shorter_way(a: Array
     assert_close(steps, np.linalg.norm(h.translation - g.translation) / 8)
 
 
-@given(chain=st.lists(twists(), min_size=1, max_size=5))
-def test_a_product_of_exponentials_is_the_loop_a_reader_would_write(chain: list[Array]) -> None:
-    products = product_of_exponentials(np.array(chain))
-    np.testing.assert_allclose(products.matrix, motion.chain(chain), atol=1e-8)
-
-
-def test_a_batch_of_chains_is_each_of_them() -> None:
-    chains = np.random.default_rng(5).normal(size=(3, 4, 6))
-    products = product_of_exponentials(chains)
-    assert products.matrix.shape == (3, 4, 4, 4)
-    for k in range(3):
-        np.testing.assert_allclose(products.matrix[k], motion.chain(chains[k]), atol=1e-12)
-
-
 def test_one_transform_moves_a_batch_and_a_batch_moves_one_point() -> None:
     rng = np.random.default_rng(9)
     xis, points = rng.normal(size=(7, 6)), rng.normal(size=(7, 3))
@@ -119,12 +80,3 @@ def test_one_transform_moves_a_batch_and_a_batch_moves_one_point() -> None:
         )
     np.testing.assert_array_equal(SE3.join([batch, batch[2:4]])[8].matrix, batch[3].matrix)
     np.testing.assert_array_equal(SE3.identity(2, 3).matrix, np.tile(np.eye(4), (2, 3, 1, 1)))
-
-
-def test_a_twist_about_the_vertical_is_a_circle() -> None:
-    """A quarter turn to the left while walking ahead ends ahead and to the left by the circle's
-    radius.
-    """
-    quarter = SE3.exp([0, 0, np.pi / 2, 100.0, 0, 0])
-    np.testing.assert_allclose(quarter.translation, [200 / np.pi, 200 / np.pi, 0], atol=1e-12)
-    np.testing.assert_allclose(so3.log(quarter.rotation), [0, 0, np.pi / 2], atol=1e-15)

@@ -28,14 +28,9 @@ def test_log_undoes_exp_up_to_pi(direction: Array) -> None:
         sign = np.sign(back @ omega) if below_pi < 1e-9 else 1.0
         np.testing.assert_allclose(sign * back, omega, atol=1e-9, rtol=0)
         assert np.linalg.norm(back) <= np.pi + 1e-15
-
-
-@given(direction=directions())
-def test_log_of_a_half_turn_written_down_exactly(direction: Array) -> None:
-    half_turn = 2.0 * np.outer(direction, direction) - np.eye(3)
-    omega = so3.log(half_turn)
-    assert abs(np.linalg.norm(omega) - np.pi) < 1e-9
-    assert np.linalg.norm(np.cross(omega, direction)) < 1e-9
+    half_turn = so3.log(2.0 * np.outer(direction, direction) - np.eye(3))
+    assert abs(np.linalg.norm(half_turn) - np.pi) < 1e-9
+    assert np.linalg.norm(np.cross(half_turn, direction)) < 1e-9
 
 
 @given(omega=rotation_vectors())
@@ -46,14 +41,10 @@ def test_exp_is_the_matrix_exponential_and_a_proper_rotation(omega: Array) -> No
     assert abs(np.linalg.det(rotation) - 1.0) < 1e-13
 
 
-@given(omega=rotation_vectors(), x=directions())
-def test_hat_is_the_cross_product(omega: Array, x: Array) -> None:
-    np.testing.assert_allclose(so3.hat(omega) @ x, np.cross(omega, x), atol=1e-15)
-
-
 @given(a=rotation_vectors(), b=rotation_vectors())
-def test_cross_is_numpys(a: Array, b: Array) -> None:
+def test_cross_and_hat_are_the_cross_product(a: Array, b: Array) -> None:
     np.testing.assert_array_equal(so3.cross(a, b), np.cross(a, b))
+    np.testing.assert_allclose(so3.hat(a) @ b, np.cross(a, b), atol=1e-15)
     np.testing.assert_array_equal(so3.cross(a, np.stack([b, a])), np.cross(a, np.stack([b, a])))
 
 
@@ -72,15 +63,6 @@ def test_series_and_formula_meet_where_they_part(function: Callable[[list[float]
             function([0.0, 0.0, limit * (1 + 1e-9)]),
         )
         np.testing.assert_allclose(below, above, atol=1e-11)
-
-
-@given(omega=rotation_vectors())
-def test_the_quaternion_is_the_half_angle(omega: Array) -> None:
-    q = so3.quaternion(so3.exp(omega))
-    angle = np.linalg.norm(omega)
-    assert q[0] >= 0
-    assert abs(q[0] - np.cos(angle / 2)) < 1e-12
-    assert abs(np.linalg.norm(q) - 1.0) < 1e-15
 
 
 def test_batches_are_what_single_ones_are() -> None:

@@ -3,7 +3,9 @@ law alone.
 """
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from liex_lab.optics.refraction import Water
 
 Array = NDArray[np.float64]
 
@@ -56,3 +58,18 @@ def seen(
             two.append(view[..., axis] / view[..., 2])
         disparity.append((two[0] - two[1]) / baseline_mm)
     return xy, 1.0 / np.mean(disparity, axis=0)
+
+
+def true_points(water: Water, rays: ArrayLike, depth: ArrayLike) -> Array:
+    """Positions (..., 3) mm of points at apparent depths (...) mm on rays (..., 2), x and y of
+    (x, y, 1), by the quadratic equation of `Water.law`.
+    """
+    xy, z = np.asarray(rays, float), np.asarray(depth, float)
+    law = water.law(xy)
+    excess = law[..., 3] * z - 1.0
+    b = law[..., 1] - law[..., 2] * z
+    wet = np.maximum(excess, 0.0)
+    below = 2.0 * wet / (b + np.sqrt(b * b + 4.0 * law[..., 0] * wet))
+    seeming = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1) * z[..., None]
+    down = law[..., 4:7] + below[..., None] * law[..., 7:]
+    return np.where((excess > 0)[..., None], down, seeming)

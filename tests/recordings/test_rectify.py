@@ -19,6 +19,7 @@ from liex_lab.recordings.rectify import (
     straight_camera,
 )
 from tests.oracles.plate import Plate
+from tests.oracles.refraction import true_points
 
 CAMERA = Camera(150.0, 152.0, 79.5, 61.0, 160, 120)
 BARREL = replace(CAMERA, distortion=Distortion.of("plumb_bob", [-0.25, 0.06, 0.002, -0.001]))
@@ -50,7 +51,7 @@ def carried_by_hand(depth: np.ndarray, camera: Camera, water: Water) -> np.ndarr
     ideal = ideal_camera(camera, water)
     v, u = np.mgrid[0 : camera.height, 0 : camera.width]
     points = (
-        water.true_points(camera.unproject(np.stack([u, v], -1), 1.0)[..., :2], depth)
+        true_points(water, camera.unproject(np.stack([u, v], -1), 1.0)[..., :2], depth)
         + water.lift_mm
     )
     places = np.floor(ideal.project(points) + 0.5)
