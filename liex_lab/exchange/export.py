@@ -134,11 +134,7 @@ def write_csv_folder(session: Session, path: Path) -> None:
 
 
 MAX_ROWS = 1_048_576  # of a sheet, its headings included
-_MOST_CHARACTERS = 32_767  # of a cell
 _UNWRITABLE = re.compile("[\\0-\\x08\\x0b\\x0c\\x0e-\\x1f\\ud800-\\udfff\\ufffe\\uffff]")  # in XML
-_CELL_BYTES = 60  # of an uncompressed sheet, at most; 40 are typical
-_OTHER_BYTES = 1 << 21  # independent of the recording's length
-_EXACT = 10**15  # Excel has 15 digits; a longer integer, such as a time in ns, is text
 
 
 def write_xlsx(session: Session, path: Path) -> None:
@@ -165,7 +161,8 @@ def write_xlsx(session: Session, path: Path) -> None:
     # openpyxl writes uncompressed sheets into the folder for temporary files, and crashes if it
     # becomes full
     folder = Path(tempfile.gettempdir())
-    needed = sum(one.num_rows * one.num_columns for one in footers) * _CELL_BYTES + _OTHER_BYTES
+    # at most 60 bytes per cell of an uncompressed sheet (40 are typical), and 2 MB for the rest
+    needed = sum(one.num_rows * one.num_columns for one in footers) * 60 + (1 << 21)
     free = shutil.disk_usage(folder).free
     if free < needed:
         raise SessionError(
@@ -201,11 +198,13 @@ def _cell(sheet: Any, value: Any) -> Any:
         value = value.item()
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return None
-    if isinstance(value, float) or (isinstance(value, int) and abs(value) < _EXACT):
+    # Excel has 15 digits; a longer integer, such as a time in ns, is text
+    if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
         return value
     text = str(value)
     if text in ("NaT", "<NA>"):
         return None
-    cell = WriteOnlyCell(sheet, value=_UNWRITABLE.sub("\ufffd", text)[:_MOST_CHARACTERS])
+    # a cell has at most 32,767 characters
+    cell = WriteOnlyCell(sheet, value=_UNWRITABLE.sub("\ufffd", text)[:32_767])
     cell.data_type = "s"
     return cell

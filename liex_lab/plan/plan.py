@@ -40,7 +40,6 @@ from liex_lab.runtime.text_files import parse_toml, read_text
 
 _HERE = Path(__file__).resolve().parents[1]
 _MOST_ARENAS = 8  # in one image
-_NOT_PLANS = {"slurm"}  # configures where sessions are measured, not how
 _HEADER = """\
 # A plan of liex_lab: all settings of a run. Copy this file, edit the copy, and use it with:
 #     liex run RECORDING --plan my-plan.toml
@@ -247,9 +246,8 @@ def plans_folder() -> Path:
 
 def known_plans() -> list[str]:
     """Names of the bundled plans, in alphabetical order."""
-    return sorted(
-        path.stem for path in plans_folder().glob("*.toml") if path.stem not in _NOT_PLANS
-    )
+    # slurm.toml configures where sessions are measured, not how
+    return sorted(path.stem for path in plans_folder().glob("*.toml") if path.stem != "slurm")
 
 
 def _settings() -> dict[str, Any]:

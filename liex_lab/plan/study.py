@@ -35,10 +35,8 @@ STUDY_FILE = "study.toml"
 RAW = "rawdata"
 DERIVED = "derivatives/liex-lab"
 # NeuroBlueprint's name of the folder of behavioural data
-RESULTS = "behav"
 VIRTUAL = "synthetic:"
 # settings that may name a file
-_PATHS = (("arena", "zones"), ("estimation", "model"), ("animal", "skeleton"))
 _PATTERNS = {
     "id": "should be letters and digits only, as in m01",
     "animal": "should be the id of an animal: letters and digits only, as in m01",
@@ -301,7 +299,8 @@ class Study:
             recording = one.recording
             if not recording.startswith(VIRTUAL):
                 recording = str(self.inside(recording, f"the recording of {id}"))
-            folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / RESULTS
+            # NeuroBlueprint's name of the folder of behavioural data
+            folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / "behav"
             plan = self._plan(animal, one, id)
             planned.append(PlannedSession(id, animal, recording, folder, plan, one.exclude))
         return tuple(planned)
@@ -340,7 +339,8 @@ class Study:
             where = merged(arena.set, {"arena": {"region": region}})
         for settings in (self.table.set, where, animal.set, {"session": facts}, one.set):
             table = merged(table, settings)
-        for section, key in _PATHS:
+        # settings that may name a file
+        for section, key in (("arena", "zones"), ("estimation", "model"), ("animal", "skeleton")):
             inner: Any = table.get(section)
             text = inner.get(key) if isinstance(inner, dict) else None
             if isinstance(text, str) and (self.folder / text).is_file():

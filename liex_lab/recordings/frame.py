@@ -26,7 +26,6 @@ Depth = NDArray[np.float32]
 _FEW = 16  # sample every 16th row and column
 _ROWS = 64
 _LEAST_REGION_PX = 64
-_MOST_ROOMS = 6  # kept: being filled, waiting, processed (two at once), written
 
 
 @dataclass(frozen=True)
@@ -101,7 +100,8 @@ class FrameRooms:
             if self._rooms[k].shape == shape and _references(self._rooms, k) == _UNUSED:
                 return self._rooms[k]
         alike = [room for room in self._rooms if room.shape == shape]
-        self._rooms = [*alike[1 - _MOST_ROOMS :], np.empty(shape, np.float32)]
+        # six are kept: being filled, waiting, processed (two at once), written
+        self._rooms = [*alike[-5:], np.empty(shape, np.float32)]
         return self._rooms[-1]
 
 
@@ -208,14 +208,13 @@ Stored = NDArray[Any]
 PLAUSIBLE_MM = (100.0, 10_000.0)
 COLOUR = "nyu-hand"  # the one encoding of 8-bit colour images
 LARGEST_STEP = 0xFFFF
-_NO_DISPARITY = 2047  # of 11 bits
-_FARTHEST_MM = 10_000.0
 
 
 def _disparity(stored: Stored) -> Stored:
     """Kinect v1 disparity of 11 bits, as in NYU Depth v2: z = 351.3 / (1092.5 - value) m."""
     ahead = 1092.5 - stored.astype(np.float32)
-    read = (ahead > 0) & (stored != _NO_DISPARITY)
+    # 2047 of 11 bits is no reading
+    read = (ahead > 0) & (stored != 2047)
     return np.where(read, 351_300.0 / np.where(read, ahead, 1.0), 0.0).astype(np.float32)
 
 
@@ -253,7 +252,7 @@ def decode(
     values = _MILLIMETRES[encoding][1](stored)
     if values is stored and stored.dtype.kind in "iu":
         largest = float(np.iinfo(stored.dtype).max)
-        if largest * abs(unit_mm) > _FARTHEST_MM:
+        if largest * abs(unit_mm) > 10_000.0:
             unread = (*unread, largest)
     if values is stored or stored.ndim == 3:
         return depth_mm(values, unit_mm, unread)

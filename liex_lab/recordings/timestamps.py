@@ -21,12 +21,8 @@ Times = NDArray[np.int64]
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
 # stamps are rounded if their unit exceeds this share of the usual step, or if this share of the
 # steps differs from a multiple of it by this much
-_COARSE = 1e-3
 _OFTEN = 0.05
-_OFF = 0.1
 _LEAST = 0.8  # least share of the mean step for a real clock; less comes from stamps without one
-_TICKS_NS = (1_000_000, 15_625_000)  # of coarse clocks, near a camera's step
-_RARELY = 2.25  # times the median: longest step across one missing frame
 _LONGER = (3, 16, 64, 256)  # frames missing in gaps, short ones first, as they define the step
 _FAR = 3  # steps; the clock's phase may change across more of them
 CLOCK_JUMP_NS = (
@@ -34,7 +30,6 @@ CLOCK_JUMP_NS = (
 )  # no camera drops frames for a minute: it was stopped, or its clock was set
 # frames on either side that distinguish a lasting jump from a few stamps out of order
 _SURE = 5
-LATEST_NS = 2**32 * 10**9  # the year 2106: the limit of the replay's messages
 LIMIT_NS = 2**62  # the year 2116 on the usual clock; leaves room for sums in int64
 # the years 2000 to 2100: other stamps do not count from 1970
 PLAUSIBLE_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)
@@ -130,15 +125,17 @@ def rounded_step(times_ns: Times) -> int:
     if usual <= 0:
         return 0
     unit = int(np.gcd.reduce(dt))
-    if unit > _COARSE * usual:
+    if unit > 1e-3 * usual:
         # lost frames with exact stamps also give multiples of the step
-        rounded = unit <= usual / 2 or unit in _TICKS_NS
+        # of coarse clocks, near a camera's step
+        rounded = unit <= usual / 2 or unit in (1_000_000, 15_625_000)
     else:
-        off = np.abs(dt / usual - np.rint(dt / usual)) > _OFF
+        off = np.abs(dt / usual - np.rint(dt / usual)) > 0.1
         rounded = bool(off.mean() > _OFTEN)
     if not rounded:
         return 0
-    step = first = float(dt[dt <= _RARELY * usual].mean())
+    # at most one frame is missing in such a step
+    step = first = float(dt[dt <= 2.25 * usual].mean())
     for window in (2, 4, 8, 16):
         apart = _in_phase(times_ns, step, window)
         near = apart <= _FAR
@@ -439,7 +436,8 @@ def _join_clocks(times_ns: Times) -> tuple[Times, NDArray[np.int64]]:
 
 def unwritable_times(times_ns: Times) -> str:
     """Why stamps (n,) ns cannot be written into a session; "" if they can."""
-    if not len(times_ns) or (times_ns.min() >= 0 and times_ns.max() < LATEST_NS):
+    # until the year 2106, the limit of the replay's messages
+    if not len(times_ns) or (times_ns.min() >= 0 and times_ns.max() < 2**32 * 10**9):
         return ""
     return (
         f"the time stamps go from {times_ns.min() * 1e-9:.6g} s to {times_ns.max() * 1e-9:.6g} s, "

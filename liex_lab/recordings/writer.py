@@ -386,8 +386,6 @@ class _Cdr:
         self.content += raw
 
 
-DEPTH_TOPIC = "/camera/depth"
-CALIBRATION_TOPICS = {"foxglove": "/camera/calibration", "ros": "/camera/camera_info"}
 _CHUNK_BYTES = 128 * 1024  # an image closes its chunk, so that reading one frame unpacks one frame
 
 
@@ -431,8 +429,10 @@ class McapDepthWriter(RecordingWriter):
         facts = {key: str(value) for key, value in (metadata or {}).items()}
         self._writer.add_metadata(NOTES, facts | {"camera_source": camera.source})
         raw, packed, lens = self._messages.schemas
-        self._lens = self._channel(CALIBRATION_TOPICS[messages], *lens)
-        self._depth = self._channel(DEPTH_TOPIC, *(raw if packing == "raw" else packed))
+        self._lens = self._channel(
+            {"foxglove": "/camera/calibration", "ros": "/camera/camera_info"}[messages], *lens
+        )
+        self._depth = self._channel("/camera/depth", *(raw if packing == "raw" else packed))
 
     def _channel(self, topic: str, name: str, definition: bytes) -> int:
         number = self._writer.register_schema(name, self._messages.schema_encoding, definition)

@@ -21,7 +21,6 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.runtime.places import unlinked
 
 # errors of network shares and file systems that do not support fsync
-_NOT_HERE = {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}
 _AT_ONCE = 8  # files synchronised in parallel; the disk handles them in one go
 
 
@@ -203,16 +202,14 @@ def _sync(path: Path, flags: int) -> None:
     try:
         os.fsync(opened)
     except OSError as error:
-        if error.errno not in _NOT_HERE:
+        # errors of network shares and file systems that do not support fsync
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}:
             raise
     finally:
         os.close(opened)
 
 
 # Exclusive advisory file lock (flock, or msvcrt.locking on Windows): one process at a time.
-
-
-_NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
 
 
 def take_lock(path: Path) -> IO[bytes] | None:
@@ -227,7 +224,9 @@ def take_lock(path: Path) -> IO[bytes] | None:
         PlaceError: the path is a symbolic link.
         OSError: the file cannot be created.
     """
-    opened = os.open(unlinked(path), os.O_WRONLY | os.O_CREAT | os.O_APPEND | _NO_LINKS, 0o666)
+    opened = os.open(
+        unlinked(path), os.O_WRONLY | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0), 0o666
+    )
     file = os.fdopen(opened, "ab")
     try:
         _lock(file)

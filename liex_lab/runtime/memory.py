@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 
 _ZEROS = 1 << 20  # bytes written at once
-_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 # memory maps of all arrays on disk in use, and their lock
 _maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 _lock = threading.Lock()
@@ -93,7 +92,7 @@ def on_disk(folder: Path) -> Allocator:
                 _reserve(file, size)
                 return _registered(np.memmap(file, dtype, "r+", shape=shape))
         except OSError as error:
-            if error.errno in _FULL:
+            if error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC)):
                 raise
             return np.empty(shape, dtype)
 
@@ -230,10 +229,6 @@ _NO_MEMORY = (
     "the memory was not enough; close other programs, use fewer workers, or let the process have "
     "more (ulimit -v unlimited), and run the same command again"
 )
-_NO_FILES = (
-    "the system lets this process open no more files; allow more (ulimit -n 1024) and run the same "
-    "command again"
-)
 _FILES = (errno.EMFILE, errno.ENFILE)
 
 
@@ -247,7 +242,10 @@ def why_short(error: BaseException | None) -> str:
     while error is not None and id(error) not in asked:
         asked.add(id(error))
         if isinstance(error, OSError) and error.errno in _FILES:
-            return _NO_FILES
+            return (
+                "the system lets this process open no more files; allow more (ulimit -n 1024) and "
+                "run the same command again"
+            )
         if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
             return _NO_MEMORY
         if not isinstance(error, LiexError) and any(sign in str(error).lower() for sign in _MEMORY):

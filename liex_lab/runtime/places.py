@@ -17,7 +17,6 @@ from typing import IO, Any
 
 from liex_lab.errors import PlaceError
 
-_NOT_IN_NAMES = set('/\\:*?"<>|')
 _UNSEEN = {"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"}  # Unicode categories: control, surrogate ...
 _RESERVED = {"CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$"}  # device names on Windows
 _RESERVED |= {f"{port}{digit}" for port in ("COM", "LPT") for digit in "0123456789¹²³"}
@@ -37,7 +36,7 @@ def safe_name(text: str, ending: str = "") -> str:
         digits of the text's SHA-256 are appended, so that two texts never share a name.
     """
     name = "".join(
-        "_" if c in _NOT_IN_NAMES or unicodedata.category(c) in _UNSEEN else c for c in text
+        "_" if c in set('/\\:*?"<>|') or unicodedata.category(c) in _UNSEEN else c for c in text
     )
     name = name.strip(" ")
     if name[:1] in (".", "-"):  # hidden, or mistaken for an option
@@ -181,7 +180,6 @@ _WHY = {
     errno.EFBIG: "is full: it takes no file as large as this one",
 }
 _WHY[errno.ENOSPC] = "is full"  # overrides EDQUOT on systems without quotas
-_PROBE = 1 << 20  # bytes; a disk with less free space counts as full
 STRETCH = 1 << 26  # bytes of a long file that are in memory at once
 
 
@@ -200,7 +198,8 @@ def probe_full(folder: Path) -> OSError | None:
     """
     try:
         with tempfile.TemporaryFile(dir=folder, buffering=0) as file:
-            rest = _PROBE
+            # bytes; a disk with less free space counts as full
+            rest = 1 << 20
             while rest:
                 rest -= file.write(bytes(rest)) or 0
     except OSError as error:

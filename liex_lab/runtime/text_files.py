@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 _SEPARATORS = (";", "\t", ",")
 _SAMPLE = 50  # lines used to detect the separator
 _STATED = re.compile(r'"?sep=(.)"?\s*', re.IGNORECASE)  # first line as Excel writes and reads it
@@ -41,7 +40,8 @@ def decoded(raw: bytes) -> str:
     Raises:
         ValueError: it is not valid text; the message names the line and the bytes.
     """
-    encoding = next((name for mark, name in _MARKS.items() if raw.startswith(mark)), "utf-8")
+    wide = raw.startswith((b"\xff\xfe", b"\xfe\xff"))
+    encoding = "utf-16" if wide else "utf-8-sig" if raw.startswith(b"\xef\xbb\xbf") else "utf-8"
     even, odd = (raw[first:4096:2].count(0) for first in (0, 1))
     if encoding == "utf-8" and (even == 0) != (odd == 0) and 4 * (even + odd) > len(raw[:4096]):
         encoding = "utf-16-le" if odd else "utf-16-be"

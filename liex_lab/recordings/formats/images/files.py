@@ -32,7 +32,6 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import Depth, Stored
 from liex_lab.runtime.progress import Progress
 
-MAX_PIXELS = 1 << 24  # well above any depth camera; a larger stated size is damage
 
 Size = tuple[int, int]  # width, height, pixels
 Points = NDArray[np.float64]
@@ -178,7 +177,8 @@ def something_else(path: Path | str, kind: str) -> RecordingError:
 
 def too_large(size: Size) -> bool:
     """Whether a size (width, height), px, is beyond any depth camera (2^24 px) and so invalid."""
-    return size[0] * size[1] > MAX_PIXELS
+    # well above any depth camera; a larger stated size is damage
+    return size[0] * size[1] > (1 << 24)
 
 
 def not_depth_error(where: str, found: str, width: int, height: int) -> RecordingError:
@@ -323,7 +323,6 @@ def png_size(head: bytes, where: str, colour: bool = False) -> Size | None:
 # PGM images (Netpbm P5, 16 bits), in the byte order of the standard or in the reverse one.
 
 
-_DTYPES = {"big": ">u2", "little": "<u2"}
 _GAP = rb"(?:\s|#[^\n]*\n)+"
 _HEADER = re.compile(rb"P5" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,9})" + _GAP + rb"(\d{1,5})\s")
 _PGM_HEAD_BYTES = 1024  # comments included
@@ -342,7 +341,9 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
     Raises:
         RecordingError: none is whole, one is not depth, or their sizes differ.
     """
-    big, little = (partial(_decode_pgm, dtype=dtype) for dtype in _DTYPES.values())
+    big, little = (
+        partial(_decode_pgm, dtype=dtype) for dtype in (">u2", "<u2")
+    )
     stack = open_files(
         files, "PGM", _probe_pgm, little if byte_order == "little" else big, progress
     )
@@ -496,9 +497,7 @@ def read_pclzf_camera(image: Path) -> dict[str, float] | None:
 # TIFF images, 16-bit or float32 grey, one or many per file, including BigTIFF and ImageJ.
 
 
-_SPARE = 1 << 20  # bytes
 _LZMA = (34925,)
-_UNPACKERS = (8, 32946, 50013, *_LZMA)  # codes of compression: DEFLATE, LZMA
 
 # tifffile reports damage twice, as an exception and in the log; hide the
 # log
@@ -574,9 +573,10 @@ class TiffStack(Stack):
 
         tifffile unpacks whole pieces of DEFLATE and LZMA in memory, of any size.
         """
-        if page.compression not in _UNPACKERS:
+        # codes of compression: DEFLATE, LZMA
+        if page.compression not in (8, 32946, 50013, *_LZMA):
             return True
-        most = 4 * self.width * self.height + _SPARE
+        most = 4 * self.width * self.height + (1 << 20)
         file = page.parent.filehandle
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
             file.seek(offset)

@@ -34,7 +34,6 @@ N_JOINTS = 36
 
 _NAME = re.compile(r"(?:depth|synthdepth)_([123])_(\d{7})\.png")
 _N_ASKED = 8  # images: one may be damaged
-_NO_MATLAB = (NotImplementedError, ValueError, TypeError, OSError, EOFError, MemoryError)
 _NOMINAL_HZ = 30.0  # the data set has no times; its cameras ran at this rate
 
 
@@ -151,7 +150,15 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
         )
     try:
         found: dict[str, Any] = loadmat(path, variable_names=wanted)
-    except (*_NO_MATLAB, MatReadError) as error:
+    except (
+        NotImplementedError,
+        ValueError,
+        TypeError,
+        OSError,
+        EOFError,
+        MemoryError,
+        MatReadError,
+    ) as error:
         raise RecordingError(
             f"{path} should be the NYU data set's MATLAB file, but: {error}; copy it again"
         ) from None
@@ -207,9 +214,6 @@ POINTS: dict[str, dict[str, float]] = {
     "palm": {"palm": 1.0},
 }
 NYU_IDS = (*range(0, 25, 3), 25, 27, 30, 31, 32)  # of the data set's 36 points, from 0
-_LITTLE_WRIST = 11
-_THUMB_WRIST = 12
-_START_BEND = 0.3  # rad: the bending direction of a straight finger is ambiguous
 
 
 def points_of_joints(skeleton: Skeleton) -> Array:
@@ -310,13 +314,14 @@ def fit_hands(skeleton: Skeleton, points: Array) -> Fit:
         n poses in the frame of the points, and their residuals.
     """
     palm = points[:, PALM]
-    wrists = points[:, [_LITTLE_WRIST, _THUMB_WRIST]]
+    wrists = points[:, [11, 12]]  # on the little finger's side, and on the thumb's
     forward = _unit(palm - wrists.mean(axis=1))
     left = wrists[:, 1] - wrists[:, 0]
     left = _unit(left - np.sum(left * forward, axis=1, keepdims=True) * forward)
     rotation = np.stack([forward, left, np.cross(forward, left)], axis=-1)
     angles = np.zeros((len(points), skeleton.n_joints, 3))
-    angles[:, 1:, 1] = _START_BEND * skeleton.axes[1:, 1]
+    # 0.3 rad: the bending direction of a straight finger is ambiguous
+    angles[:, 1:, 1] = 0.3 * skeleton.axes[1:, 1]
     start = Pose(SE3(rotation, palm.copy()), angles, np.ones(len(points)))
     return fit_poses(skeleton, points, points_of_joints(skeleton), start)
 

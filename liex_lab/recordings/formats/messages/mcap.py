@@ -63,7 +63,6 @@ _CHUNK = struct.Struct(
 # chunks of at most this size are unpacked ahead
 THREADS = 2
 FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
-_SUMMARY = (*FACTS, Opcode.CHUNK_INDEX, Opcode.METADATA_INDEX, Opcode.STATISTICS)
 LARGEST_FACT = 1 << 24  # bytes of one such record
 DAMAGE = (
     McapError,
@@ -267,7 +266,7 @@ class McapFile(MessageFile):
                 return
             while at < ending:
                 kind, start, end = self._record(at)
-                if kind in _SUMMARY and end - start <= LARGEST_FACT:
+                if end - start <= LARGEST_FACT:
                     self._learn(kind, ReadDataStream(BytesIO(self.file.read(end - start))))
                 at = end
         except DAMAGE:

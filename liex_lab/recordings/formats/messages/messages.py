@@ -160,7 +160,6 @@ Parser = Callable[[memoryview], Message]
 # A chunk has some megabytes. A damaged one may state any size, and a few bytes can unpack to
 # any number of zeros.
 _LARGEST_CHUNK = 1 << 27
-_PACKINGS = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # by their first bytes
 
 
 class MessagePlace(NamedTuple):
@@ -407,7 +406,8 @@ def unpacked_message(data: memoryview) -> memoryview:
     Raises:
         DamagedChunk: it cannot be unpacked.
     """
-    packing = _PACKINGS.get(bytes(data[:4]))
+    # by their first bytes
+    packing = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}.get(bytes(data[:4]))
     if packing is None:
         return data
     whole = Chunk(0, len(data), packing, _LARGEST_CHUNK, 0, cut=True)  # its size is not stated

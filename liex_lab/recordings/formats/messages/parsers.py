@@ -97,8 +97,6 @@ def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
 # foxglove.PackedElementField's NumericType: NumPy's name of it
 _FIELD_TYPES = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
 _SECOND = 10**9
-_STAMP = 1 << 3 | 2  # protobuf's key of field 1, the stamp, length-delimited
-_NO_JSON = (ValueError, TypeError, AttributeError, OverflowError, RecursionError)
 
 
 def _raw_image(m: Any) -> RawPicture:
@@ -158,7 +156,14 @@ def _from_json(kind: Any, read: Callable[[Any], Message], data: memoryview) -> M
             seconds, nanos = (int(stamp.get(key) or 0) for key in ("sec", "nsec"))
             stamp = Timestamp(seconds=seconds, nanos=nanos).ToJsonString()
         return read(ParseDict({**content, "timestamp": stamp}, kind(), ignore_unknown_fields=True))
-    except (*_NO_JSON, JsonError) as error:
+    except (
+        ValueError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        RecursionError,
+        JsonError,
+    ) as error:
         raise DamagedMessage(str(error)) from None
 
 
@@ -174,7 +179,8 @@ def stamp_in(head: memoryview) -> int | None:
         The stamp; None if another field is first, as in a message without a stamp.
     """
     # the largest length in one byte
-    if len(head) < 2 or head[0] != _STAMP or head[1] > min(127, len(head) - 2):
+    # protobuf's key of field 1, the stamp, length-delimited
+    if len(head) < 2 or head[0] != (1 << 3 | 2) or head[1] > min(127, len(head) - 2):
         return None
     try:
         stamp = Timestamp.FromString(bytes(head[2 : 2 + head[1]]))

@@ -27,7 +27,6 @@ from liex_lab.runtime.progress import Progress, silent
 
 IsRelevant = Callable[[Channel], bool]
 
-_MAGIC = b"#ROSBAG V"
 _VERSION = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
 _U32 = struct.Struct("<I")
@@ -35,9 +34,7 @@ _TIME = struct.Struct("<II")
 _MESSAGE = 2
 _HEADER = 3
 _CHUNK = 5
-_CHUNK_INFO = 6
 _CONNECTION = 7
-_LARGEST_HEADER = 1 << 24  # bytes; a connection's contains its message definition
 _DAMAGE = (KeyError, ValueError, OverflowError, struct.error)
 
 
@@ -67,7 +64,7 @@ def open_bag(
     if magic == _SQLITE:
         return open_topic(Db3File(path, file), "rosbag2", camera, topic, progress)
     file.close()
-    if magic.startswith(_MAGIC):
+    if magic.startswith(b"#ROSBAG V"):
         raise RecordingError(
             f"{path} is a bag of an old ROS; bring it to version 2.0 with `rosbag fix` and give "
             "that"
@@ -135,7 +132,8 @@ class BagFile(MessageFile):
         self.file.seek(at)
         (n_header,) = _U32.unpack(self.file.read(_U32.size))
         begin = at + 2 * _U32.size + n_header
-        if n_header > _LARGEST_HEADER or begin > self.size:
+        # a connection's header contains its message definition
+        if n_header > (1 << 24) or begin > self.size:
             raise ValueError("a header is too long")
         block = self.file.read(n_header + _U32.size)
         (n_data,) = _U32.unpack_from(block, n_header)
@@ -152,7 +150,7 @@ class BagFile(MessageFile):
         try:
             while 0 < at < self.size:
                 facts, begin, end = self._record(at)
-                if facts["op"][0] == _CHUNK_INFO:
+                if facts["op"][0] == 6:  # information on a chunk
                     self.starts += struct.unpack("<Q", facts["chunk_pos"])
                 elif (
                     facts["op"][0] == _CONNECTION and end <= self.size
