@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.runtime.threads import serial_products
+from liex_lab.runtime.processes import serial_products
 
 Array = NDArray[np.float64]
 

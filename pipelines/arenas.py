@@ -22,8 +22,8 @@ from liex_lab.plan.plan import toml_value
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import unwritable_times
-from liex_lab.runtime import processes, threads
-from liex_lab.runtime.places import inside
+from liex_lab.runtime import processes
+from liex_lab.runtime.durable import inside
 from liex_lab.runtime.progress import Progress, silent, telling_of_compiling
 from liex_lab.scene.zones import masks_apart
 
@@ -90,7 +90,7 @@ def run_arenas(
     pool = pool or processes.processes_for(workers or 1)
     outcomes: dict[str, ArenaOutcome] = {}
     with (
-        threads.imported_ahead(*HEAVY),
+        processes.imported_ahead(*HEAVY),
         telling_of_compiling(progress) as progress,
         build_recording(recording, first, progress) as opened,
     ):

@@ -27,8 +27,7 @@ from liex_lab.behaviour.cohort import (
     usual_measures,
 )
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.plan.study import Study
-from liex_lab.plan.subject import same
+from liex_lab.plan.study import Study, same
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, evidence

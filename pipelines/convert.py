@@ -28,10 +28,10 @@ from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingErr
 from liex_lab.optics.camera import Lens
 from liex_lab.plan import Plan
 from liex_lab.recordings import Recording, camera_file, open_recording
-from liex_lab.recordings.formats.messages.statements import SUFFIX, PackFacts, hash_note
+from liex_lab.recordings.formats.messages.messages import SUFFIX, PackFacts, hash_note
 from liex_lab.recordings.frame import Depth, region_mask, whole_steps
 from liex_lab.recordings.writer import STAMPS, McapDepthWriter, PictureFolderWriter, RecordingWriter
-from liex_lab.runtime import durable, places
+from liex_lab.runtime import durable
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.zones import Corners
 from liex_lab.tracking.tracker import FrameTracker
@@ -349,7 +349,7 @@ def _target(
 ) -> Path:
     """Path of the archive."""
     beside = Path(recording).parent if opened.sources else Path()
-    target = Path(to) if to is not None else places.inside(beside, opened.name, f"{SUFFIX}.mcap")
+    target = Path(to) if to is not None else durable.inside(beside, opened.name, f"{SUFFIX}.mcap")
     if target.suffix.lower() != ".mcap":
         raise RecordingError(
             f"an archive is an MCAP file; give --to NAME.mcap (in Python to=), not {target.name}"

@@ -28,7 +28,7 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
-from liex_lab.runtime import durable, places
+from liex_lab.runtime import durable
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, correcting, corrections, evidence, rrd
 from liex_lab.sessions.folder import file_facts
@@ -77,8 +77,8 @@ def correct_session(
     """
     raw = Session.open(session, raw=True)
     with durable.locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
-        folder = places.unlinked_tree(raw.path / corrections.FOLDER)
-        aside = places.unlinked(raw.path / f"{corrections.FOLDER}.old")
+        folder = durable.unlinked_tree(raw.path / corrections.FOLDER)
+        aside = durable.unlinked(raw.path / f"{corrections.FOLDER}.old")
         durable.put_back(folder, aside)  # a process may have been killed here
         made_of = corrections.basis(raw.path, raw.metadata)
         log = corrections.read_log(raw.path)
@@ -94,7 +94,7 @@ def correct_session(
                 f"{raw.path} has no corrections to apply; `liex correct --help` says how to make "
                 "one"
             )
-        part = places.unlinked(raw.path / f"{corrections.FOLDER}.part")
+        part = durable.unlinked(raw.path / f"{corrections.FOLDER}.part")
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         try:

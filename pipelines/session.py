@@ -35,11 +35,11 @@ from liex_lab.catalog import DEMO, find_sample
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.optics.camera import unusual_centre, unusual_lens
 from liex_lab.plan import Plan
-from liex_lab.plan.subject import animal_part, find_subject, letters, same
+from liex_lab.plan.study import animal_part, find_subject, letters, same
 from liex_lab.recordings.frame import DepthFrame, FrameRooms
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN, unwritable_times
-from liex_lab.runtime import memory, places, processes, threads
+from liex_lab.runtime import durable, memory, processes
 from liex_lab.runtime.processes import WorkerPool
 from liex_lab.runtime.progress import Progress, silent, telling_of_compiling
 from liex_lab.sessions import (
@@ -225,7 +225,7 @@ def observed(
     waiting: deque[tuple[list[DepthFrame], Future[observations.Observations]]] = deque()
     # matrix products are serial meanwhile: the limit is per process, not per thread
     with (
-        threads.serial_products(),
+        processes.serial_products(),
         ThreadPoolExecutor(
             _AT_ONCE, initializer=numba.set_num_threads, initargs=(n_threads // _AT_ONCE,)
         ) as pool,
@@ -316,12 +316,12 @@ def run_session(
             "them with `liex run`, or in Python with run_arenas"
         )
     with (
-        threads.imported_ahead(*HEAVY),
+        processes.imported_ahead(*HEAVY),
         telling_of_compiling(progress) as progress,
-        threads.in_background(partial(build_estimator, first)) as estimator,
+        processes.in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):
-        folder = folder or places.inside(Path(out), first.session.name or opened.name, ".liex")
+        folder = folder or durable.inside(Path(out), first.session.name or opened.name, ".liex")
         if problem := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {problem}")
         cautions: list[str] = []
@@ -520,7 +520,7 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
         return
     rooms = FrameRooms()
     frames = opened.frames(first)
-    yield from threads.prefetch(iter(lambda: rooms.filled(frames, CHUNK), []))
+    yield from processes.prefetch(iter(lambda: rooms.filled(frames, CHUNK), []))
 
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:

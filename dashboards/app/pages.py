@@ -25,7 +25,7 @@ from liex_lab.actions.vocabulary import PALETTE, UNLABELLED_COLOUR
 from liex_lab.behaviour import cohort
 from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.plan.subject import references_first
+from liex_lab.plan.study import references_first
 from liex_lab.sessions import Session, correcting
 from liex_lab.sessions.corrections import author_name
 

@@ -18,7 +18,7 @@ from liex_lab.actions.vocabulary import action_colours
 from liex_lab.behaviour.activity import Occupancy, occupancy
 from liex_lab.behaviour.cohort import counted_units
 from liex_lab.behaviour.statistics import animal_means
-from liex_lab.plan.subject import references_first
+from liex_lab.plan.study import references_first
 from liex_lab.sessions import Session
 
 from ..units import counted, read_as, shown, titled

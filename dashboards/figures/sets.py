@@ -16,9 +16,8 @@ from matplotlib.figure import Figure
 
 from liex_lab.behaviour.cohort import WHO
 from liex_lab.errors import SessionError
-from liex_lab.plan.subject import references_first
-from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.places import inside, safe_name, unlinked
+from liex_lab.plan.study import references_first
+from liex_lab.runtime.durable import inside, replacing, safe_name, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_harmless
 from liex_lab.sessions import Session

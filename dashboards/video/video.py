@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.places import unlinked
+from liex_lab.runtime.durable import replacing, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 

@@ -30,8 +30,7 @@ from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.mlp import Network
 from liex_lab.recordings.timestamps import median_step
-from liex_lab.runtime.memory import Allocator, blocks
-from liex_lab.runtime.shapes import check_shapes
+from liex_lab.runtime.memory import Allocator, blocks, check_shapes
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]

@@ -52,7 +52,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, check_forest
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.processes import threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, in_camera_frame
 
 Array = NDArray[np.float64]

@@ -39,7 +39,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.cascade import TrainingSet
 from liex_lab.estimation.training import ProgressCallback
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.processes import threads
 from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
 
 if TYPE_CHECKING:

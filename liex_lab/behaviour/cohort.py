@@ -38,7 +38,7 @@ from liex_lab.behaviour.statistics import (
     smallest_p,
     spread_of_animals,
 )
-from liex_lab.plan.subject import alike, one_animal, references_first
+from liex_lab.plan.study import alike, one_animal, references_first
 from liex_lab.tables.schema import shown, table_columns, titled, to_pandas
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.shapes import Rows
+from liex_lab.runtime.memory import Rows
 
 Array = NDArray[np.float64]
 

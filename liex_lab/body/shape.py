@@ -18,8 +18,8 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.runtime.kernels import kernel
-from liex_lab.runtime.shapes import Rows, check_index, check_shapes
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.memory import Rows, check_index, check_shapes
+from liex_lab.runtime.processes import in_parallel
 
 Array = NDArray[np.float64]
 

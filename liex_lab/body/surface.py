@@ -22,8 +22,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, one_line
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.shapes import check_index, check_shapes
-from liex_lab.runtime.threads import in_parallel, threads
+from liex_lab.runtime.memory import check_index, check_shapes
+from liex_lab.runtime.processes import in_parallel, threads
 
 Array = NDArray[np.float64]
 Window = tuple[int, int, int, int]

@@ -18,7 +18,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import so3
-from liex_lab.runtime.shapes import Rows
+from liex_lab.runtime.memory import Rows
 
 Array = NDArray[np.float64]
 

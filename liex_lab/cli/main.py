@@ -52,7 +52,7 @@ from liex_lab.cli.sessions import (
     verify,
 )
 from liex_lab.errors import LiexError, MisfitError, printable
-from liex_lab.runtime import memory, places, processes
+from liex_lab.runtime import durable, memory, processes
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -375,8 +375,8 @@ def main() -> None:
     except LiexError as error:
         _fail(str(error), error.exit_code)
     except OSError as error:
-        if places.is_full(error):
-            _fail(f"{places.why_full(error)}; make room there and run the same command again")
+        if durable.is_full(error):
+            _fail(f"{durable.why_full(error)}; make room there and run the same command again")
         if error.errno not in _USERS_TO_MEND:
             _fault(error)
         where = f" {error.filename}" if error.filename else ""

@@ -31,8 +31,8 @@ from liex_lab.estimation.method import Method
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict, predict_each
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.shapes import check_index, check_shapes
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.memory import check_index, check_shapes
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene._blob_kernels import N_MOMENTS
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 

@@ -40,7 +40,7 @@ from liex_lab.estimation.refine import (
 )
 from liex_lab.estimation.scoring import Chosen, choose, corrected, with_best, with_expected_error
 from liex_lab.forests.forest import Forest
-from liex_lab.runtime.threads import in_parallel, threads
+from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
 
 Array = NDArray[np.float64]

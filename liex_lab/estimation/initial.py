@@ -19,7 +19,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict_each
 from liex_lab.forests.grow import grow_forest
 from liex_lab.geometry import so3
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import moment_columns
 
 Array = NDArray[np.float64]

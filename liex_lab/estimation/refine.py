@@ -47,7 +47,7 @@ from liex_lab.estimation import _residual_kernels as residual_kernels
 from liex_lab.estimation.cascade import Candidates, ImageSet, body_of, residuals
 from liex_lab.geometry import SE3
 from liex_lab.mlp import Network, descend
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]

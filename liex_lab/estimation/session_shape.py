@@ -30,7 +30,7 @@ from liex_lab.body.surface import Surface
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.refine import ridge_regression
 from liex_lab.geometry import SE3
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ import pynwb
 from numpy.typing import NDArray
 
 from liex_lab.errors import SessionError
-from liex_lab.exchange.pose_files import hdf5_file
+from liex_lab.exchange.export import hdf5_file
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit
 from liex_lab.sessions.session import PULSE, PoseArrays

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, VIEW, descend
 from liex_lab.runtime.kernels import kernel
-from liex_lab.runtime.shapes import Rows, check_index, check_shapes
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.memory import Rows, check_index, check_shapes
+from liex_lab.runtime.processes import in_parallel
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from liex_lab.forests._kernels import (
 )
 from liex_lab.forests.forest import Forest, Samples, predict
 from liex_lab.runtime.kernels import inner_kernel, kernel
-from liex_lab.runtime.shapes import check_shapes
+from liex_lab.runtime.memory import check_shapes
 
 _N_THRESHOLDS = 20
 _TREES_A_STAGE = 2

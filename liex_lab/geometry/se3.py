@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.geometry import so3
-from liex_lab.runtime.shapes import Rows
+from liex_lab.runtime.memory import Rows
 
 Array = NDArray[np.float64]
 

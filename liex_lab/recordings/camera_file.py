@@ -19,7 +19,7 @@ from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.recordings.frame import ENCODINGS, Depth, Stored, decode
 from liex_lab.recordings.timestamp_files import UNITS
 from liex_lab.recordings.timestamps import start_of_day
-from liex_lab.runtime.places import named_beside
+from liex_lab.runtime.durable import named_beside
 from liex_lab.runtime.text_files import read_toml
 
 CAMERA_FILE = "camera.toml"

@@ -31,8 +31,8 @@ from liex_lab.recordings.timestamps import (
     find_gaps,
     median_step,
 )
+from liex_lab.runtime.durable import is_full
 from liex_lab.runtime.memory import why_short
-from liex_lab.runtime.places import is_full
 from liex_lab.runtime.progress import Progress, silent
 
 # name, size (bytes) and modification time (ns) of each file

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
-from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.memory import check_shapes
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene.floor import Floor, near_plane, parts
 from liex_lab.scene.support_plane import (

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import MOUSE_VIEW, VIEWS, CameraView
 from liex_lab.optics.camera import Camera, SensorCard
-from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import in_parallel, threads
+from liex_lab.runtime.memory import check_shapes
+from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import MAX_BLOBS
 from liex_lab.scene.background import (

@@ -20,8 +20,8 @@ from liex_lab.body.skeleton import CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
-from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import in_parallel, threads
+from liex_lab.runtime.memory import check_shapes
+from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene import _hand_kernels as kernels
 from liex_lab.scene.background import sample_frames
 from liex_lab.scene.floor import Floor

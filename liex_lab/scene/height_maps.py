@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import MOUSE_VIEW, CameraView
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.memory import check_shapes
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import N_MOMENTS, BlobMoments
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA, CropCamera, CropRows

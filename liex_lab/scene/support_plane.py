@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import VIEWS, CameraView
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.threads import side_by_side
+from liex_lab.runtime.processes import side_by_side
 from liex_lab.scene.floor import (
     FlatGround,
     Floor,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.shapes import check_shapes
-from liex_lab.runtime.threads import side_by_side
+from liex_lab.runtime.memory import check_shapes
+from liex_lab.runtime.processes import side_by_side
 from liex_lab.scene.floor import Floor, components
 from liex_lab.scene.support_plane import TargetAnimal
 

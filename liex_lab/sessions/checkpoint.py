@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt
 from liex_lab.errors import SessionError
 from liex_lab.recordings.formats.messages.mcap import MAGIC, RECORD
 from liex_lab.recordings.recording import Recording
-from liex_lab.runtime import durable, memory, places, text_files
+from liex_lab.runtime import durable, memory, text_files
 from liex_lab.runtime.progress import Progress
 
 # between two checkpoints: the most work that can be lost, besides startup
@@ -96,7 +96,7 @@ class Checkpoint:
             SessionError: another process is writing the session.
         """
         try:
-            places.unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
+            durable.unlinked_tree(folder).mkdir(parents=True, exist_ok=True)
         except FileNotFoundError as error:  # a virtual parent folder, such as /proc
             raise SessionError(
                 f"no folder can be made at {error.filename} ({error.strerror}); name another place"
@@ -399,7 +399,7 @@ def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
     began = time.monotonic()
     digest = recording.digest(progress)
     if stamp and time.monotonic() - began > EVERY_S:
-        places.unlinked(folder).mkdir(parents=True, exist_ok=True)
+        durable.unlinked(folder).mkdir(parents=True, exist_ok=True)
         durable.write_whole(folder / _INPUT, json.dumps({"stamp": stamp, "sha256": digest}))
 
 

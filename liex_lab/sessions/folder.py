@@ -17,7 +17,7 @@ from typing import Any
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime import durable, memory, places, text_files
+from liex_lab.runtime import durable, memory, text_files
 from liex_lab.sessions.checkpoint import OWN, hold
 from liex_lab.sessions.corrections import FOLDER, LOG, corrected_folder, read_log
 from liex_lab.sessions.provenance import versions
@@ -48,8 +48,8 @@ def describe_failure(error: BaseException, stage: str, frame: int | None) -> dic
     if isinstance(error, LiexError):
         reason, _, remedy = str(error).rpartition("; ")
         reason, remedy = (reason, remedy) if reason else (remedy, "see `liex doctor`")
-    elif isinstance(error, OSError) and places.is_full(error):
-        reason = places.why_full(error)
+    elif isinstance(error, OSError) and durable.is_full(error):
+        reason = durable.why_full(error)
         remedy = "make room there and run it again"
     elif short:
         reason, _, remedy = short.partition("; ")
@@ -80,8 +80,8 @@ def write_failure(folder: Path, failure: dict[str, Any]) -> None:
         folder: the session folder; created if needed.
         failure: the result of `describe_failure`.
     """
-    places.unlinked(folder).mkdir(parents=True, exist_ok=True)
-    text = json.dumps(places.storable_document(failure), indent=2, default=str)
+    durable.unlinked(folder).mkdir(parents=True, exist_ok=True)
+    text = json.dumps(durable.storable_document(failure), indent=2, default=str)
     durable.write_whole(folder / FAILED_FILE, text + "\n")
 
 
@@ -142,7 +142,7 @@ def check_writable(path: Path, overwrite: bool) -> None:
         PlaceError: the session's path, or NAME.part or NAME.old, is a symbolic link.
     """
     for place in (path, part_folder(path), aside_folder(path)):
-        places.unlinked(place)
+        durable.unlinked(place)
     nearest = next((folder for folder in path.parents if folder.exists()), None)
     if nearest is not None and not nearest.is_dir():
         raise SessionError(

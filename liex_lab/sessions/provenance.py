@@ -31,7 +31,7 @@ from liex_lab.plan import Plan
 from liex_lab.plan.sections import Factor, SubjectFacts
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import Gap
-from liex_lab.runtime.places import storable
+from liex_lab.runtime.durable import storable
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.scene import UNKNOWN, Arena, Scene
 from liex_lab.scene.zones import Zone

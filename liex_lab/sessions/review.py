@@ -24,7 +24,7 @@ from pydantic.dataclasses import dataclass
 
 from liex_lab.actions.labels import RaterAgreement, cohens_kappa
 from liex_lab.errors import SessionError, one_line
-from liex_lab.runtime import durable, places
+from liex_lab.runtime import durable
 from liex_lab.sessions.corrections import UNREADABLE
 from liex_lab.sessions.session import Session
 
@@ -239,7 +239,7 @@ def write_review(folder: Path, review: Review) -> Path:
         review: the review.
     """
     folder.mkdir(exist_ok=True)
-    path = places.inside(folder, review.name, ENDING)
+    path = durable.inside(folder, review.name, ENDING)
     durable.write_whole(path, review.to_json())
     return path
 
@@ -254,7 +254,7 @@ def read_review(folder: Path, name: str) -> Review:
     Raises:
         SessionError: it does not exist, or is damaged.
     """
-    path = places.inside(folder, name, ENDING)
+    path = durable.inside(folder, name, ENDING)
     try:
         return Review.from_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -22,7 +22,7 @@ from liex_lab.actions import vocabulary
 from liex_lab.behaviour.body import logged_of
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
-from liex_lab.runtime import memory, places
+from liex_lab.runtime import durable, memory
 from liex_lab.sessions.checkpoint import RRD_HEAD, rrd_messages
 from liex_lab.sessions.cutouts import Boxes
 from liex_lab.sessions.provenance import Provenance
@@ -276,7 +276,7 @@ class ReplayWriter:
             size = self._path.stat().st_size if self._path.is_file() else 0
             waited = waited + _TURN_S if size == before else 0.0
             before = size
-            if waited > _PATIENCE_S or places.probe_full(self._path.parent):
+            if waited > _PATIENCE_S or durable.probe_full(self._path.parent):
                 raise self._unwritten()
 
     def _unwritten(self) -> Exception:
@@ -290,7 +290,7 @@ class ReplayWriter:
         return self._why_unwritten()
 
     def _why_unwritten(self) -> Exception:
-        return places.probe_full(self._path.parent) or SessionError(
+        return durable.probe_full(self._path.parent) or SessionError(
             f"the replay {self._path} was not written whole; make room on the disk or mend it, and "
             "run the same command again"
         )

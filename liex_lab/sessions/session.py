@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import MissingPackageError, SessionError, how_to_install
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime import memory, places, text_files
+from liex_lab.runtime import durable, memory, text_files
 from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
 from liex_lab.sessions.corrections import (
@@ -433,7 +433,7 @@ def video_path(folder: Path, name: str, what: str = "") -> Path:
         what: its subject, such as an action; "" for the whole session.
     """
     tail = "".join(c if c.isalnum() or c in "-_.+" else "_" for c in what)
-    return folder / places.safe_name(f"{name}_{tail}" if tail else name, ".mp4")
+    return folder / durable.safe_name(f"{name}_{tail}" if tail else name, ".mp4")
 
 
 def stretch(start_s: float | None, stop_s: float | None) -> str:

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.runtime import durable, memory, places, text_files
+from liex_lab.runtime import durable, memory, text_files
 from liex_lab.sessions.checkpoint import LOGS, STRETCHES, Checkpoint, Columns
 from liex_lab.sessions.corrections import FOLDER
 from liex_lab.sessions.cutouts import FILE as CUTOUTS_FILE
@@ -389,7 +389,7 @@ class SessionWriter:
         made = corrections_for(self.path)
         if made is not None and made.parent != self.path:
             self.note(corrections_taken_from=made.parent.name)
-        document = places.storable_document(self._document)
+        document = durable.storable_document(self._document)
         text = json.dumps(document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         del rows, of_track
@@ -456,7 +456,7 @@ class SessionWriter:
         copy = self._folder / FOLDER
         shutil.rmtree(copy, ignore_errors=True)
         if made is not None:  # they apply again if the poses are the same
-            shutil.copytree(places.unlinked_tree(made), copy)
+            shutil.copytree(durable.unlinked_tree(made), copy)
             durable.sync_tree(copy)
         durable.put_in_place(self._folder, self.path, aside_folder(self.path))
         self._done = True
@@ -479,10 +479,10 @@ def full_disk(folder: Path, error: BaseException | None) -> str | None:
     if error is None or isinstance(error, LiexError) or not isinstance(error, Exception):
         return None
     if isinstance(error, OSError) and error.errno is not None:
-        found = error if places.is_full(error) else None
+        found = error if durable.is_full(error) else None
     else:
-        found = places.probe_full(folder)
-    return None if found is None else places.why_full(found, folder.parent)
+        found = durable.probe_full(folder)
+    return None if found is None else durable.why_full(found, folder.parent)
 
 
 def observation_rows(

@@ -26,7 +26,7 @@ from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
-from liex_lab.runtime.shapes import Rows
+from liex_lab.runtime.memory import Rows
 from liex_lab.scene.floor import Floor
 from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import ANIMAL, NORMAL, OBJECT, UNIT

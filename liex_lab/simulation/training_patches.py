@@ -22,8 +22,8 @@ from liex_lab.body.shape import Body, BodyShape
 from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
-from liex_lab.runtime.shapes import Rows
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.memory import Rows
+from liex_lab.runtime.processes import threads
 from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import ANIMAL, EROSION, NOISE, NORMAL, OBJECT
 from liex_lab.simulation.scene import PART_FACES, SceneSpec, draw_views, rounded

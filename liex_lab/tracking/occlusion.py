@@ -19,7 +19,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.runtime.kernels import kernel
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
 

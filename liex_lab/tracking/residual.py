@@ -24,7 +24,7 @@ from liex_lab.body.shape import BodyShape
 from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
 from liex_lab.runtime.kernels import kernel
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import CROP, HeightMaps, Segmenter
 from liex_lab.tracking.observations import joints_of
 from liex_lab.tracking.trust import MOST_ERROR, MOST_RESIDUAL, finite_median

@@ -23,7 +23,7 @@ from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
 from liex_lab.runtime.memory import Allocator
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.processes import threads
 from liex_lab.scene.background import has_noise
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.height_maps import HeightMaps, Patches, Segmenter

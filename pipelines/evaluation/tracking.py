@@ -36,8 +36,8 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.evaluation.scores import TRACKING_PROTOCOL, Followed, tracking_figures
 from liex_lab.plan import Plan
+from liex_lab.runtime.processes import threads
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.threads import threads
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.simulation import simulator
 from liex_lab.tracking.curve import OnlineTracker

@@ -1,7 +1,7 @@
 """A study file template from the recordings in a folder: `liex cohort init`.
 
 Names of animals and sessions come from the recordings' metadata, BIDS-like folders (`sub-m01`,
-`ses-01_date-20260821`), other folders and file names, see `plan.subject`. Duplicate recordings are
+`ses-01_date-20260821`), other folders and file names, see `plan.study`. Duplicate recordings are
 listed once.
 """
 
@@ -14,8 +14,16 @@ from itertools import count
 from pathlib import Path
 
 from liex_lab.errors import StudyError
-from liex_lab.plan.study import DERIVED, RAW, STUDY_FILE, Study
-from liex_lab.plan.subject import CONTAINER, find_subject, letters, same
+from liex_lab.plan.study import (
+    CONTAINER,
+    DERIVED,
+    RAW,
+    STUDY_FILE,
+    Study,
+    find_subject,
+    letters,
+    same,
+)
 from liex_lab.recordings.open import stated_subject
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.progress import Progress, silent

@@ -17,7 +17,7 @@ import pandas as pd
 
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
-from liex_lab.runtime import durable, places, text_files
+from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Board
 from liex_lab.sessions import Session, verdict
 from liex_lab.sessions.corrections import Description
@@ -108,7 +108,7 @@ STUDY_SESSIONS = table_columns(TABLE)
 def write_study_table(study: Study, standings: Sequence[SessionStatus]) -> Path:
     """Write study.parquet, study.csv and study_columns.json; returns the path of the CSV."""
     folder = study.cohort_folder
-    places.unlinked_below(study.results, folder).mkdir(parents=True, exist_ok=True)
+    durable.unlinked_below(study.results, folder).mkdir(parents=True, exist_ok=True)
     rows = study_rows(study, standings)
     names = [column.name for column in STUDY_SESSIONS]
     block = {name: [row[name] for row in rows] for name in names}
@@ -229,7 +229,7 @@ def run_study(
     unseen = to_be_looked_at(study, only, retry, again)
     written = [*(one.session.folder for one in before), *(session.folder for session in unseen)]
     for place in (study.cohort_folder, *written):
-        places.unlinked_below(study.results, place)
+        durable.unlinked_below(study.results, place)
     study.cohort_folder.mkdir(parents=True, exist_ok=True)
     with durable.locked(
         study.cohort_folder / ".lock",

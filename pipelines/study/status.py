@@ -15,8 +15,7 @@ import pandas as pd
 from liex_lab.behaviour.cohort import unified
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
-from liex_lab.plan.study import PlannedSession, Study
-from liex_lab.plan.subject import find_subject, same
+from liex_lab.plan.study import PlannedSession, Study, find_subject, same
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.folder import read_failure
 from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, state_in_words, verdict_in

@@ -50,8 +50,8 @@ from liex_lab.estimation.training import (
 )
 from liex_lab.geometry import SE3
 from liex_lab.runtime.durable import replacing, write_whole
+from liex_lab.runtime.processes import serial_products
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.threads import serial_products
 from liex_lab.scene.background import SPREADS
 from liex_lab.scene.hand_segmenter import HandPatches
 from liex_lab.scene.height_maps import HeightMaps, Patches, moment_columns, view_of

@@ -23,8 +23,8 @@ from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior, labels_of, session_clues
 from liex_lab.runtime.durable import replacing
+from liex_lab.runtime.processes import serial_products
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.threads import serial_products
 from liex_lab.scene.height_maps import HeightMaps, view_of
 from liex_lab.simulation import simulator, training_patches
 

@@ -9,7 +9,7 @@ from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.forests._kernels import VIEW
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, Camera
-from liex_lab.runtime.threads import in_parallel
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import HeightMaps

@@ -20,7 +20,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import PRIMESENSE_QVGA
 from liex_lab.plan import Plan
 from liex_lab.recordings import Recording, open_recording
-from liex_lab.recordings.formats.messages.statements import PackFacts, hash_note
+from liex_lab.recordings.formats.messages.messages import PackFacts, hash_note
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.sessions import Session

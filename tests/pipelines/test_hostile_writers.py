@@ -21,8 +21,7 @@ from liex_lab.pipelines.correct import correct_session
 from liex_lab.errors import PlaceError, SessionError
 from liex_lab.exchange import TARGETS, export
 from liex_lab.plan import Plan
-from liex_lab.runtime.durable import locked, take_lock
-from liex_lab.runtime.places import inside, safe_name
+from liex_lab.runtime.durable import inside, locked, safe_name, take_lock
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit, Description
 from liex_lab.sessions.folder import describe_failure, write_failure

@@ -15,7 +15,7 @@ from liex_lab.pipelines.session import observed
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.recording import Recording
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.processes import threads
 from liex_lab.simulation.simulator import world_of
 from liex_lab.tracking.observations import COLUMNS
 

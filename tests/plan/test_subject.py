@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liex_lab.plan.subject import (
+from liex_lab.plan.study import (
     alike,
     animal_part,
     find_subject,

@@ -11,14 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liex_lab.errors import PlaceError
-from liex_lab.runtime import places
-from liex_lab.runtime.durable import replacing, write_whole
-from liex_lab.runtime.places import (
+from liex_lab.runtime import durable
+from liex_lab.runtime.durable import (
     inside,
+    replacing,
     safe_name,
     storable_document,
     unlinked_below,
     unlinked_tree,
+    write_whole,
 )
 from tests.hostile_names import NAMES
 
@@ -130,12 +131,12 @@ def test_a_folder_takes_the_place_of_a_folder(tmp_path: Path) -> None:
 def test_parts_are_written_in_their_order_and_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stretch: int
 ) -> None:
-    monkeypatch.setattr(places, "STRETCH", stretch)
+    monkeypatch.setattr(durable, "STRETCH", stretch)
     rng = np.random.default_rng(3)
     parts = [rng.bytes(int(n)) for n in rng.integers(0, 5000, 100)]
     path = tmp_path / "written"
     with path.open("wb") as file:
-        n = places.write_through((memoryview(part) for part in parts), file)
+        n = durable.write_through((memoryview(part) for part in parts), file)
     assert path.read_bytes() == b"".join(parts)
     assert n == path.stat().st_size
 
@@ -146,14 +147,14 @@ def test_what_is_let_go_is_read_again(tmp_path: Path) -> None:
     path.write_bytes(content)
     with path.open("rb") as file:
         assert file.read(1000) == content[:1000]
-        places.let_go(file, 0, len(content))
+        durable.let_go(file, 0, len(content))
         assert file.read() == content[1000:]
 
 
 def test_a_system_that_cannot_be_told_writes_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(places, "STRETCH", 10)
+    monkeypatch.setattr(durable, "STRETCH", 10)
     monkeypatch.delattr(os, "posix_fadvise", raising=False)
     out: IO[bytes] = io.BytesIO()  # has no number of its own either
-    assert places.write_through([memoryview(b"abcdefgh")] * 4, out) == 32
+    assert durable.write_through([memoryview(b"abcdefgh")] * 4, out) == 32
     out.seek(0)
     assert out.read() == b"abcdefgh" * 4

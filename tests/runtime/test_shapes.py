@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from liex_lab.runtime.shapes import check_index, check_shapes
+from liex_lab.runtime.memory import check_index, check_shapes
 
 
 def test_arrays_that_fit_together_pass() -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numba
 import pytest
 
-from liex_lab.runtime.threads import imported_ahead, in_background, prefetch, side_by_side
+from liex_lab.runtime.processes import imported_ahead, in_background, prefetch, side_by_side
 
 
 def test_items_made_ahead_are_the_same_in_the_same_order() -> None:
@@ -89,7 +89,7 @@ def test_modules_are_imported_while_a_block_runs_and_no_more_after_it(
         assert ended.wait(10.0)
         raise ImportError(name)
 
-    monkeypatch.setattr("liex_lab.runtime.threads.import_module", slowly)
+    monkeypatch.setattr("liex_lab.runtime.processes.import_module", slowly)
     others = set(threading.enumerate())
     with imported_ahead("colorsys", "there_is_no_such_module"):
         assert begun.wait(10.0)

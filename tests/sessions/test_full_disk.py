@@ -17,7 +17,7 @@ import pytest
 
 import liex_lab.sessions.rrd as replay
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime.places import is_full, why_full
+from liex_lab.runtime.durable import is_full, why_full
 from liex_lab.sessions import SessionWriter
 from tests.sessions.interrupted import MOUSE, forked, write_session
 

@@ -47,8 +47,7 @@ from liex_lab.recordings.timestamps import (
     start_of_day,
     unpaired,
 )
-from liex_lab.runtime.durable import Scratch
-from liex_lab.runtime.places import STRETCH, is_full, let_go, write_through
+from liex_lab.runtime.durable import STRETCH, Scratch, is_full, let_go, write_through
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_text
 

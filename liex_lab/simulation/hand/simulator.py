@@ -26,8 +26,8 @@ from liex_lab.recordings.formats.images.nyu import (
     NyuReference,
     fit_hands,
 )
-from liex_lab.runtime.shapes import Rows
-from liex_lab.runtime.threads import threads
+from liex_lab.runtime.memory import Rows
+from liex_lab.runtime.processes import threads
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import sight_rotations
 from liex_lab.simulation import _render_kernels as kernels

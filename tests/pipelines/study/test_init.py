@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 
 from liex_lab import cli
 from liex_lab.errors import StudyError
-from liex_lab.plan.study import Study
-from liex_lab.plan.subject import find_subject
+from liex_lab.plan.study import Study, find_subject
 
 
 def touch(root: Path, *names: str) -> None:

@@ -32,7 +32,6 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import Depth, Stored
 from liex_lab.runtime.progress import Progress
 
-
 Size = tuple[int, int]  # width, height, pixels
 Points = NDArray[np.float64]
 
@@ -341,9 +340,7 @@ def open_pgms(files: list[Path], progress: Progress, byte_order: str | None = No
     Raises:
         RecordingError: none is whole, one is not depth, or their sizes differ.
     """
-    big, little = (
-        partial(_decode_pgm, dtype=dtype) for dtype in (">u2", "<u2")
-    )
+    big, little = (partial(_decode_pgm, dtype=dtype) for dtype in (">u2", "<u2"))
     stack = open_files(
         files, "PGM", _probe_pgm, little if byte_order == "little" else big, progress
     )

@@ -1,7 +1,7 @@
 """Selection of the depth topic in an MCAP file or ROS bag, with its calibration and its clock.
 
 One walk over the file finds the topics whose first message is depth, the calibrations, and further
-statements of known programs (`statements`). The calibration with the same frame_id is used, nearest
+statements of known programs (`Statements`). The calibration with the same frame_id is used, nearest
 by topic name, and mapped onto the image by its binning and region of interest; a rectified topic
 uses P instead of K. Stamps are the sensor's, or the times of sending or logging if images have
 none.
@@ -29,6 +29,7 @@ from liex_lab.optics.camera import Camera, Distortion, Lens, is_central
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, fitting, is_infrared
 from liex_lab.recordings.formats.messages.messages import (
     CLOUD_SCHEMAS,
+    SUFFIX,
     Calibration,
     Channel,
     DamagedChunk,
@@ -38,8 +39,11 @@ from liex_lab.recordings.formats.messages.messages import (
     IndexedMessages,
     MessageFile,
     MessagePlace,
+    PackFacts,
     Parser,
     Statement,
+    Statements,
+    calibration_in,
     printable,
 )
 from liex_lab.recordings.formats.messages.parsers import (
@@ -48,12 +52,6 @@ from liex_lab.recordings.formats.messages.parsers import (
     picture_size,
     plain_schema,
     stated_kind,
-)
-from liex_lab.recordings.formats.messages.statements import (
-    SUFFIX,
-    PackFacts,
-    Statements,
-    calibration_in,
 )
 from liex_lab.recordings.frame import PLAUSIBLE_MM, Depth, unread_where_damaged
 from liex_lab.recordings.recording import Recording
