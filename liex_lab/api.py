@@ -3,6 +3,8 @@
 `run_session` is `liex run`, `run_demo` is `liex demo`, and so on. Jobs are imported on first use.
 """
 
+# ruff: noqa: F401 - imported for the types of what `__getattr__` imports
+
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -12,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import MissingPackageError, how_to_install
-from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board, Progress, progress_board, silent
 
 if TYPE_CHECKING:
@@ -20,9 +21,32 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.compare import compare_groups
     from liex_lab.pipelines.correct import correct_session, describe_session
     from liex_lab.pipelines.drawing import draw_figures, export_video
+    from liex_lab.pipelines.evaluation.actions import evaluate_actions
+    from liex_lab.pipelines.evaluation.motion import evaluate_motion
+    from liex_lab.pipelines.evaluation.nyu import evaluate_nyu
+    from liex_lab.pipelines.evaluation.paper.run import run_tables
+    from liex_lab.pipelines.evaluation.pose import (
+        evaluate_builds,
+        evaluate_pose,
+        evaluate_reference,
+        evaluate_sizes,
+    )
+    from liex_lab.pipelines.evaluation.scale import evaluate_report, run_scale, write_long
+    from liex_lab.pipelines.evaluation.scenes import evaluate_scenes
+    from liex_lab.pipelines.evaluation.speed import (
+        evaluate_live,
+        evaluate_recordings,
+        evaluate_speed,
+    )
+    from liex_lab.pipelines.evaluation.statistics import evaluate_statistics
+    from liex_lab.pipelines.evaluation.tracking import evaluate_tracking, search_noise
     from liex_lab.pipelines.live import follow_live
     from liex_lab.pipelines.session import run_demo, run_session
     from liex_lab.pipelines.study.status import SessionStatus
+    from liex_lab.pipelines.training.action_model import train_actions
+    from liex_lab.pipelines.training.motion_model import train_tracking
+    from liex_lab.pipelines.training.pose_model import train_model
+    from liex_lab.pipelines.training.shape_model import train_shape
     from liex_lab.pipelines.verify import verify_session
     from liex_lab.sessions.corrections import Correction
 
@@ -37,6 +61,29 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "follow_live": "live",
     "run_demo": "session",
     "verify_session": "verify",
+    "write_long": "evaluation.scale",
+    "run_scale": "evaluation.scale",
+    "evaluate_tracking": "evaluation.tracking",
+    "evaluate_scenes": "evaluation.scenes",
+    "evaluate_actions": "evaluation.actions",
+    "run_tables": "evaluation.paper.run",
+    # used by the command line only
+    "evaluate_pose": "evaluation.pose",
+    "evaluate_builds": "evaluation.pose",
+    "evaluate_sizes": "evaluation.pose",
+    "evaluate_reference": "evaluation.pose",
+    "evaluate_speed": "evaluation.speed",
+    "evaluate_recordings": "evaluation.speed",
+    "evaluate_live": "evaluation.speed",
+    "evaluate_report": "evaluation.scale",
+    "evaluate_statistics": "evaluation.statistics",
+    "evaluate_motion": "evaluation.motion",
+    "evaluate_nyu": "evaluation.nyu",
+    "search_noise": "evaluation.tracking",
+    "train_actions": "training.action_model",
+    "train_model": "training.pose_model",
+    "train_shape": "training.shape_model",
+    "train_tracking": "training.motion_model",
 }
 
 __all__ = [  # noqa: RUF022 - in the order of the manual
@@ -106,6 +153,7 @@ def run_study(
     from liex_lab.pipelines.correct import correct_session
     from liex_lab.pipelines.session import run_session
     from liex_lab.pipelines.study.run import run_study as job
+    from liex_lab.plan.study import Study
 
     return job(
         Study.load(study),
@@ -194,211 +242,3 @@ def serve_dashboard(
         regions=StatedRegions(study),
     )
     serve(app, host, port, lambda found: told(address(host, found, token)))
-
-
-def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
-    """Write a session of a virtual mouse of any length; returns its cost in memory and time.
-
-    The frames of one short recording are repeated forwards and backwards, so that only costs that
-    grow with the length of a recording are measured.
-
-    Args:
-        minutes: length of the recording, min, at 30 frames per second.
-        out: parent of the session folder long.liex.
-
-    Returns:
-        `peak_memory_mb` (None if the system does not report it) and `seconds`.
-    """
-    from liex_lab.dashboards.report.report import write_report
-    from liex_lab.pipelines.evaluation.scale import write_long as job
-
-    return job(minutes, out, write_report)
-
-
-def run_scale(
-    n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
-) -> dict[str, Any]:
-    """Measure the cost of a study: sessions per hour, memory, and time by step.
-
-    Sessions per hour are given by number of workers (one and two measured, more simulated), memory
-    by length of recording.
-
-    Args:
-        n_frames: length of each virtual recording, frames of 640 x 480 px.
-        minutes: lengths of the recordings whose memory is measured, min.
-        progress: receives progress reports.
-
-    Returns:
-        Numbers, with their definitions and assumptions as text.
-    """
-    from liex_lab.pipelines.evaluation.scale import evaluate_scale
-    from liex_lab.pipelines.session import run_session
-
-    return evaluate_scale(run_session, n_frames, tuple(minutes), progress)
-
-
-def evaluate_tracking(
-    animal: str = "mouse",
-    sequence: str = "hard",
-    *,
-    model: str | Path | None = None,
-    paper: bool = False,
-    n_frames: int | None = None,
-    figure: Path | None = None,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Compare single frames, Lie-X Algorithm 3 and the default tracker on a test sequence.
-
-    Args:
-        animal: name of the skeleton: fish, mouse or hand.
-        sequence: name of the fixed virtual test sequence.
-        model: a pose model by name or path; None uses the animal's bundled one.
-        paper: also compare Algorithms 1 and 3 with the parts of the paper's variant.
-        n_frames: number of frames of the sequence; None uses all.
-        figure: PNG file for the joint error over time; None draws none.
-        progress: receives progress reports.
-
-    Returns:
-        Results of each row, speed, and the protocol as text.
-    """
-    from functools import partial
-
-    from liex_lab.dashboards.paper.figures import draw_tracking
-    from liex_lab.pipelines.evaluation.tracking import evaluate_tracking as measure
-
-    draw = None if figure is None else partial(draw_tracking, path=figure)
-    return measure(
-        animal,
-        sequence,
-        model=model,
-        paper=paper,
-        n_frames=n_frames,
-        draw=draw,
-        progress=progress,
-    )
-
-
-def evaluate_scenes(
-    only: Sequence[str] = (),
-    *,
-    n_frames: int = 300,
-    n_recordings: int = 1,
-    sealed: bool = False,
-    pictures: Path | None = None,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Measure rendered scenes that mimic lab recordings, and score the tables.
-
-    Args:
-        only: names of scenes; () uses all.
-        n_frames: length of each recording.
-        n_recordings: recordings of each scene, each of another animal.
-        sealed: use the held-out seeds, which are not for development.
-        pictures: folder for drawn frames, one PNG per scene; None draws none.
-        progress: receives progress reports.
-
-    Returns:
-        `rows` of results by name, and the protocol as text.
-
-    Raises:
-        LiexError: there is no such scene.
-    """
-    from functools import partial
-
-    from liex_lab.dashboards.paper.figures import draw_scene
-    from liex_lab.pipelines.evaluation.scenes import evaluate_scenes as measure
-
-    draw = None if pictures is None else partial(draw_scene, folder=pictures)
-    return measure(
-        only,
-        n_frames=n_frames,
-        n_recordings=n_recordings,
-        sealed=sealed,
-        draw=draw,
-        progress=progress,
-    )
-
-
-def evaluate_actions(
-    animal: str = "fish",
-    *,
-    model: str | Path | None = None,
-    pose_model: str | Path | None = None,
-    minutes: float = 30.0,
-    figure: Path | None = None,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Score action recognition on cut sequences and on uncut virtual recordings.
-
-    Args:
-        animal: an animal with simulated actions: fish or mouse.
-        model: an action model by name or path; None uses the bundled one or, if there is none,
-            trains one.
-        pose_model: the pose model for the frames; None uses the animal's own.
-        minutes: length of the uncut test recordings, min.
-        figure: PNG file for the confusion matrices; None draws none.
-        progress: receives progress reports.
-
-    Returns:
-        Accuracy on sequences, F1 of the timeline, both by frame rate, and the protocol as text.
-
-    Raises:
-        LiexError: there are no simulated actions for this animal.
-    """
-    from functools import partial
-
-    from liex_lab.dashboards.paper.figures import draw_confusions
-    from liex_lab.pipelines.evaluation.actions import evaluate_actions as measure
-
-    draw = None if figure is None else partial(draw_confusions, path=figure)
-    return measure(
-        animal, model=model, pose_model=pose_model, minutes=minutes, draw=draw, progress=progress
-    )
-
-
-def run_tables(
-    out: str | Path,
-    animals: Sequence[str] = (),
-    *,
-    n_frames: int | None = None,
-    quick: bool = False,
-    fresh: bool = False,
-    rows: Sequence[str] = (),
-    sealed: bool = False,
-    without: Sequence[str] = (),
-    nyu: Path | None = None,
-    progress: Progress = silent,
-) -> list[Path]:
-    """Make every table and figure of the Lie-X paper on one page; returns the files written.
-
-    Args:
-        out: the output folder for tables and figures.
-        animals: names of animals; () uses those with a bundled model.
-        n_frames: number of frames of each split; every row is then measured and none is stored.
-            None uses all frames.
-        quick: a run of a few minutes that only tests the code; its numbers are meaningless.
-        fresh: ignore stored rows; every variant is trained again, which takes long.
-        rows: rows to train and measure again, or `fig7`, the curves of Fig. 7; the others are
-            stored ones. () measures none.
-        sealed: measure the held-out split, which is evaluated once per release.
-        without: `tracking` or `actions`, parts of the page to skip.
-        nyu: folder of the NYU hand data, counted for Table 2; None leaves it out.
-        progress: receives progress reports.
-    """
-    from liex_lab.catalog import bundled_models
-    from liex_lab.dashboards.paper.page import write_paper
-    from liex_lab.pipelines.evaluation.paper.run import measure_paper
-
-    results, further, kept = measure_paper(
-        out,
-        animals or list(bundled_models()),
-        n_frames=n_frames,
-        quick=quick,
-        fresh=fresh,
-        rows=rows,
-        sealed=sealed,
-        without=without,
-        nyu=nyu,
-        progress=progress,
-    )
-    return [*kept, *write_paper(Path(out), results, further, quick)]

@@ -26,7 +26,7 @@ from liex_lab.sessions.corrections import LOG, corrected_folder
 from liex_lab.sessions.verdict import WHO, Entry
 
 from ..figures.animals import Recent
-from ..report.facts import warnings
+from ..report.report import warnings
 
 DONE = ("done", "changed")  # states of sessions with results
 NO_POSE = "no pose or no frame"

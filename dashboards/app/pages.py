@@ -41,7 +41,7 @@ from ..figures.style import (
     time_unit,
 )
 from ..report.contact_sheet import WORDS, scene_marks
-from ..report.facts import warnings
+from ..report.report import warnings
 from ..units import shown, titled
 from . import tables
 from .data import (

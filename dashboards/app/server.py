@@ -29,7 +29,7 @@ from liex_lab.errors import LiexError, printable
 from liex_lab.runtime.processes import Ended
 
 from ..figures.animals import DepthImages
-from . import corrections, page_region, page_review, pages, tables
+from . import corrections, page_region, pages, tables
 from .data import StudyData
 from .desk import Desks, Suggest
 
@@ -99,7 +99,7 @@ def make_app(
     scenes = page_region.Scenes(data, images, regions)
     views = _views(shown, corrections.Clerk(desks, saver), desks, scenes, Downloads(data))
     if reviews is not None:
-        views |= _review_views(page_review.Reviews(data, desks, reviews))
+        views |= _review_views(corrections.Reviews(data, desks, reviews))
     for rule, view in views.items():
         method, path = rule.split(" ")
         app.add_url_rule(path, rule.replace(".", "-"), view, methods=[method])
@@ -150,7 +150,7 @@ def _views(
     }
 
 
-def _review_views(reviews: page_review.Reviews) -> Views:
+def _review_views(reviews: corrections.Reviews) -> Views:
     """Every address of the blinded reviews, and what answers it."""
     clip = "GET /reviews/<path:name>/clip/<int:number>"
     return {

@@ -91,16 +91,10 @@ def draw_paper(results: Results, further: Mapping[str, Any], folder: Path) -> li
             if rows:
                 title = f"{animal}, {where}: truth, blue; pose of each method, red; dot: base"
                 written.append(draw_poses(title, rows, folder / name, where == "from the side"))
-    if further["nyu"]:
-        title = "NYU test frames, 14 points: labels, blue; answer, red"
-        written.append(draw_poses(title, further["nyu_hands"], folder / "fig12_nyu_hands.png"))
-    if further["tracking"]:
-        sequence, tracked = further["tracked"]
-        written.append(draw_tracking(sequence, tracked, folder / "fig18_tracking.png"))
     if further["actions"]:
         written.append(draw_key_frames(further["key_frames"], folder / "fig19_key_frames.png"))
         written.append(draw_confusions(further["actions"], folder / "fig20_confusions.png"))
-    return written
+    return [*written, *further["figures"]]
 
 
 def _sheet(

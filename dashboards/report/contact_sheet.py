@@ -22,7 +22,7 @@ from liex_lab.sessions import Session
 
 from ..figures.animals import Array, read_cutout
 from ..figures.places import hidden_places, in_image
-from ..video.relief import Relief, scale_mm
+from ..video.film import Relief, scale_mm
 
 _MOST_HIDDEN = 24  # hiding positions to mark, the longest first
 REGION = "region"

@@ -22,8 +22,7 @@ from liex_lab.sessions import Session
 
 from ..figures.groups import NO_GROUP
 from ..units import counted
-from .film import Film, write
-from .relief import scale_mm
+from .film import Film, scale_mm, write
 
 _CODECS = ("libx264", "libopenh264")
 _CLOCK = Fraction(1, 90_000)  # s, the common time unit of MP4

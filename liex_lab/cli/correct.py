@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from liex_lab import api
 from liex_lab.cli.options import group_of_verbs, print_table, say
 from liex_lab.errors import SessionError
 from liex_lab.runtime.progress import progress_bar
@@ -203,8 +204,6 @@ def describe(
     by: Author = "",
 ) -> None:
     """Set facts about a session's animal, such as subject_id=m07 group=drug."""
-    from liex_lab.api import describe_session
-
     given = {}
     for fact in facts:
         key, equals, value = fact.partition("=")
@@ -212,7 +211,7 @@ def describe(
             raise SessionError(f"a fact is written as KEY=VALUE, such as group=drug, not {fact!r}")
         given[key.strip()] = value.strip()
     with progress_bar() as progress:
-        describe_session(session, given, author=by, progress=progress)
+        api.describe_session(session, given, author=by, progress=progress)
     for key, value in given.items():
         say(f"described: {key} is {value or 'not known'}")
     say(f"report:    {session / 'report.html'}")
@@ -231,11 +230,10 @@ def _say(session: Path, sentence: Sequence[object], by: str) -> None:
 
 
 def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] = ()) -> None:
-    from liex_lab.api import correct_session
     from liex_lab.sessions.correcting import disagreements
 
     with progress_bar() as progress:
-        correct_session(session, what, undo=undo, author=by, progress=progress)
+        api.correct_session(session, what, undo=undo, author=by, progress=progress)
     for one in what[:5]:
         say(f"corrected: {one}")
     for sentence in disagreements(_opened(session)):

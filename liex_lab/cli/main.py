@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 import liex_lab
+from liex_lab import api
 from liex_lab.cli.correct import correct, describe
 from liex_lab.cli.models import evaluate, train
 from liex_lab.cli.options import (
@@ -106,12 +107,10 @@ def _options(
 @app.command(rich_help_panel=START)
 def demo(out: OutFolder = Path()) -> None:
     """Measure the bundled sample recording."""
-    from liex_lab.api import export_video, run_demo
-
     with progress_bar() as progress:
-        session = run_demo(out, progress=progress)
+        session = api.run_demo(out, progress=progress)
         try:
-            video = f"video:   {export_video(session, progress=progress)}"
+            video = f"video:   {api.export_video(session, progress=progress)}"
         except LiexError as error:  # the session is complete without it
             video = f"note: there is no video, for {error}"
     raise typer.Exit(_tell_session(session, video))
@@ -161,9 +160,7 @@ def run(
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: report a wrong plan or setting at once
     chosen = load_plan(plan, asked)
-    from liex_lab.api import run_arenas, run_session
-
-    measure = run_session if chosen.arenas is None else run_arenas
+    measure = api.run_session if chosen.arenas is None else api.run_arenas
     with progress_bar() as progress:
         measured = measure(
             recording,
@@ -260,10 +257,8 @@ def suggest(
 
     suggestions = list(job(session, model=model, n=n).itertuples())
     if video:
-        from liex_lab.api import export_video
-
         for one in suggestions:
-            export_video(session, start_s=one.start_s, stop_s=one.stop_s, overwrite=True)
+            api.export_video(session, start_s=one.start_s, stop_s=one.stop_s, overwrite=True)
     opened = Session.open(session)
     rows = []
     for one in suggestions:
@@ -300,10 +295,8 @@ def live(
 ) -> None:
     """Show skeletons in Rerun during a recording, and measure their latency."""
     chosen = load_plan(plan, settings or [])
-    from liex_lab.api import follow_live
-
     with progress_bar() as progress:
-        result = follow_live(
+        result = api.follow_live(
             source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
         )
     tell_numbers(result, json_file)

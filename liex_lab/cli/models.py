@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from liex_lab import api
 from liex_lab.cli.options import (
     AnimalName,
     JsonFile,
@@ -93,25 +94,17 @@ def train(
         return
     with progress_bar() as progress:
         if animal == "tracking" and particles:
-            from liex_lab.pipelines.evaluation.tracking import search_noise
-
-            found = search_noise(of, n_frames=n_frames, progress=progress)
+            found = api.search_noise(of, n_frames=n_frames, progress=progress)
         elif animal == "tracking":
-            from liex_lab.pipelines.training.motion_model import train_tracking
-
             tunings = out or Path("tunings.toml")
-            made = f"tunings: {train_tracking(of, tunings, workers=workers, progress=progress)}"
+            made = f"tunings: {api.train_tracking(of, tunings, workers=workers, progress=progress)}"
         elif animal == "shape":
-            from liex_lab.pipelines.training.shape_model import train_shape
-
             shapes = out or Path(f"{of}-shapes.npz")
-            made = f"shapes: {train_shape(of, shapes, workers=workers, progress=progress)}"
+            made = f"shapes: {api.train_shape(of, shapes, workers=workers, progress=progress)}"
         else:
-            from liex_lab.pipelines.training.pose_model import train_model
-
             how: Result = {"workers": workers, "n_images": n_images, "progress": progress}
             file = out or Path(f"{Path(animal).stem}.npz")
-            made = f"model: {train_model(animal, variant, file, **how)}"
+            made = f"model: {api.train_model(animal, variant, file, **how)}"
     if animal == "tracking" and particles:
         tell_numbers(found, json_file or out)
     else:
@@ -126,10 +119,8 @@ def _train_actions(
     pose_model: str | None,
     json_file: Path | None,
 ) -> None:
-    from liex_lab.pipelines.training.action_model import train_actions
-
     with progress_bar() as progress:
-        model, report = train_actions(
+        model, report = api.train_actions(
             out or Path(f"{animal}-actions.skops"),
             animal=animal,
             sessions=sessions,
@@ -222,16 +213,12 @@ def evaluate_pose(
 ) -> Result:
     """Measure joint errors on a fixed split of rendered frames (other-build: whole tracks)."""
     if split == "other-build":
-        from liex_lab.pipelines.evaluation.pose import evaluate_builds
-
         if variant != "default" or model or spine_mm:
             raise LiexError("other-build is measured with the bundled model and sizes of its own")
-        return evaluate_builds(animal, n_frames=n_frames, sealed=sealed, progress=progress)
+        return api.evaluate_builds(animal, n_frames=n_frames, sealed=sealed, progress=progress)
     if sealed:
         raise LiexError("--sealed belongs to the split other-build; leave it out")
-    from liex_lab.pipelines.evaluation.pose import evaluate_pose as measure
-
-    return measure(
+    return api.evaluate_pose(
         animal,
         split,
         variant,
@@ -254,12 +241,8 @@ def evaluate_speed(
 ) -> Result:
     """Measure frames per second by stage on one and two cores, relative to the paper's variant."""
     if recordings:
-        from liex_lab.pipelines.evaluation.speed import evaluate_recordings
-
-        return evaluate_recordings(progress=progress)
-    from liex_lab.pipelines.evaluation.speed import evaluate_speed as measure
-
-    return measure(animal, progress=progress)
+        return api.evaluate_recordings(progress=progress)
+    return api.evaluate_speed(animal, progress=progress)
 
 
 @benchmark("sizes")
@@ -272,9 +255,7 @@ def evaluate_sizes(
     progress: Progress,
 ) -> Result:
     """Measure joint errors of animals 45 to 100 mm long, with estimated sizes."""
-    from liex_lab.pipelines.evaluation.pose import evaluate_sizes as measure
-
-    return measure(animal, n_frames=n_frames, progress=progress)
+    return api.evaluate_sizes(animal, n_frames=n_frames, progress=progress)
 
 
 @evaluate.command("tables", epilog="\n\n".join(["What differs from the paper:", *DEVIATIONS, HAND]))
@@ -334,10 +315,8 @@ def evaluate_tables(
     ] = None,
 ) -> None:
     """Write all tables and figures of the paper to one page, DIR/index.html."""
-    from liex_lab.api import run_tables
-
     with progress_bar() as progress:
-        written = run_tables(
+        written = api.run_tables(
             out,
             animals or (),
             n_frames=n_frames,
@@ -380,8 +359,6 @@ def evaluate_actions(
     minutes on two cores. Measured recordings are kept in the cache folder (LIEX_CACHE), so that a
     stopped job resumes where it was.
     """
-    from liex_lab import api
-
     return api.evaluate_actions(
         animal,
         model=model,
@@ -417,8 +394,6 @@ def evaluate_tracking(
     progress: Progress,
 ) -> Result:
     """Measure joint errors over a sequence: single frames, Algorithm 3, and the default tracker."""
-    from liex_lab import api
-
     return api.evaluate_tracking(
         animal,
         sequence,
@@ -456,8 +431,6 @@ def evaluate_scenes(
     progress: Progress,
 ) -> Result:
     """Measure rendered lab scenes: found frames, joint errors, and errors not flagged."""
-    from liex_lab import api
-
     return api.evaluate_scenes(
         [name.strip() for name in only.split(",")] if only else [],
         n_frames=n_frames,
@@ -485,9 +458,7 @@ def evaluate_live(
     progress: Progress,
 ) -> Result:
     """Measure the latency of live tracking of a virtual animal."""
-    from liex_lab.pipelines.evaluation.speed import evaluate_live as measure
-
-    return measure(
+    return api.evaluate_live(
         animal, n_frames=n_frames, rate_hz=rate_hz, n_cameras=n_cameras, progress=progress
     )
 
@@ -505,9 +476,7 @@ def evaluate_statistics(
     progress: Progress,
 ) -> Result:
     """Measure false positives and power of group comparisons on simulated studies."""
-    from liex_lab.pipelines.evaluation.statistics import evaluate_statistics as measure
-
-    return measure(n_studies, effect, progress=progress)
+    return api.evaluate_statistics(n_studies, effect, progress=progress)
 
 
 @benchmark("report")
@@ -520,9 +489,7 @@ def evaluate_report(
     progress: Progress,
 ) -> Result:
     """Measure time and memory of a long session's report; SESSION is repeated to that length."""
-    from liex_lab.pipelines.evaluation.scale import evaluate_report as measure
-
-    return measure(session, minutes, progress=progress)
+    return api.evaluate_report(session, minutes, progress=progress)
 
 
 def show_hands(result: Result) -> None:
@@ -547,9 +514,7 @@ def evaluate_nyu(
     progress: Progress,
 ) -> Result:
     """Compare published results and ours on hands by the NYU protocol (14 points)."""
-    from liex_lab.pipelines.evaluation.nyu import evaluate_nyu as measure
-
-    return measure(reference, model=model, progress=progress)
+    return api.evaluate_nyu(reference, model=model, progress=progress)
 
 
 def show_motion(result: Result) -> None:
@@ -584,9 +549,9 @@ def evaluate_motion(
     progress: Progress,
 ) -> Result:
     """Compare posture and movement of a real and the virtual mouse by quantiles."""
-    from liex_lab.pipelines.evaluation.motion import evaluate_motion as measure
-
-    return measure(reference, names=names.split(","), up=up, rate_hz=rate_hz, progress=progress)
+    return api.evaluate_motion(
+        reference, names=names.split(","), up=up, rate_hz=rate_hz, progress=progress
+    )
 
 
 @benchmark("reference")
@@ -600,9 +565,7 @@ def evaluate_reference(
     progress: Progress,
 ) -> Result:
     """Compare a session with another program's measurement of the recording."""
-    from liex_lab.pipelines.evaluation.pose import evaluate_reference as measure
-
-    return measure(session, reference)
+    return api.evaluate_reference(session, reference)
 
 
 @benchmark("scale")
@@ -624,6 +587,4 @@ def evaluate_scale(
     Takes about eleven minutes on two cores, and needs a machine without other work; with --minutes
     10 alone, half of that.
     """
-    from liex_lab import api
-
     return api.run_scale(n_frames, minutes or (10.0, 60.0, 180.0), progress=progress)

@@ -18,6 +18,7 @@ from urllib.parse import quote
 
 import typer
 
+from liex_lab import api
 from liex_lab.cli.options import (
     RecordingPath,
     SessionPath,
@@ -65,12 +66,11 @@ def compare(
     ] = False,
 ) -> None:
     """Compare groups of animals: tests that the design allows, effect sizes, and sample sizes."""
-    from liex_lab.api import compare_groups
     from liex_lab.behaviour.cohort import counted_units
     from liex_lab.dashboards.units import counted
 
     with progress_bar() as progress:
-        found = compare_groups(
+        found = api.compare_groups(
             places,
             out,
             measures or (),
@@ -140,11 +140,10 @@ def figures(
     ] = None,
 ) -> None:
     """Draw publication figures: occupancy, trajectory, ethogram, transitions, groups and more."""
-    from liex_lab.api import draw_figures
     from liex_lab.dashboards.units import counted
 
     with progress_bar() as progress:
-        found = draw_figures(
+        found = api.draw_figures(
             place, only=only or (), formats=formats or ("svg", "pdf"), out=out, progress=progress
         )
     if found["empty"]:
@@ -197,10 +196,8 @@ def export(
     from liex_lab.sessions import Session
 
     if to == "video":
-        from liex_lab.api import export_video
-
         with progress_bar() as progress:
-            video = export_video(
+            video = api.export_video(
                 places,
                 out,
                 actions=actions or (),
@@ -493,15 +490,13 @@ def cohort(
         raise typer.BadParameter(
             "a folder is named only after init, as in `liex cohort init FOLDER`"
         )
-    from liex_lab.api import run_study
-
     if scheduler is not None:
         from liex_lab.pipelines.study.cluster import is_encrypted
 
         if not is_encrypted(scheduler):
             say(f"what goes to and from {scheduler} is not encrypted, and each side runs what the")
             say("other sends: a scheduler for a network that you trust, or tls://")
-    standings = run_study(
+    standings = api.run_study(
         study,
         workers=workers,
         scheduler=scheduler,
@@ -533,8 +528,6 @@ def dashboard(
     ] = False,
 ) -> None:
     """Open a study in the browser; Ctrl+C stops the server."""
-    from liex_lab.api import serve_dashboard
-
     with progress_bar() as progress, ExitStack() as stack:
 
         def told(address: str) -> None:
@@ -544,7 +537,7 @@ def dashboard(
                 folder = stack.enter_context(TemporaryDirectory(prefix="liex-"))
                 webbrowser.open(page_that_opens(address, Path(folder)).as_uri())
 
-        serve_dashboard(study, host=host, port=port, told=told, progress=progress)
+        api.serve_dashboard(study, host=host, port=port, told=told, progress=progress)
 
 
 def page_that_opens(address: str, folder: Path) -> Path:
@@ -569,10 +562,8 @@ def verify(
     ] = None,
 ) -> None:
     """Check a session's files and, with --recording, whether re-running reproduces its tables."""
-    from liex_lab.api import verify_session
-
     with progress_bar() as progress:
-        findings = verify_session(session, recording, progress=progress)
+        findings = api.verify_session(session, recording, progress=progress)
     for finding in findings:
         say(f"{finding.state:6}{finding.sentence}")
     if any(finding.state == "wrong" for finding in findings):

@@ -16,13 +16,14 @@ it, and scores two recognisers on individuals that neither was trained on:
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from liex_lab.dashboards.paper.figures import draw_confusions
 from numpy.typing import NDArray
 from sklearn.metrics import f1_score
 from sklearn.tree import DecisionTreeClassifier
@@ -86,17 +87,17 @@ def evaluate_actions(
     model: str | Path | None = None,
     pose_model: str | Path | None = None,
     minutes: float = 30.0,
-    draw: Callable[[dict[str, Any]], object] | None = None,
+    figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Scores of action recognition on generated behaviour; `liex evaluate actions`.
+    """Score action recognition on cut-out sequences and uncut virtual recordings.
 
     Args:
         animal: `fish` or `mouse`.
         model: an action model; None uses the bundled one or, if absent, trains one.
         pose_model: another model than the animal's own for measuring the frames.
         minutes: total length of the uncut test recordings.
-        draw: called with the result, to draw a figure.
+        figure: PNG of the confusion matrices; None draws none.
         progress: called with the progress of rendering and measuring.
 
     Returns:
@@ -154,8 +155,8 @@ def evaluate_actions(
             fast_minutes=sum(one.observations.seconds[-1] for one in fast) / 60.0,
         ),
     }
-    if draw is not None:
-        draw(result)
+    if figure is not None:
+        draw_confusions(result, figure)
     return result
 
 

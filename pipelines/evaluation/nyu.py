@@ -10,11 +10,11 @@ The published results are also scored on exactly the frames that ours were measu
 mean over 8,252 frames and one over a few are not comparable.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from liex_lab.dashboards.paper.figures import draw_poses
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, ModelError, RecordingError
@@ -33,7 +33,6 @@ from liex_lab.simulation.hand.pose_prior import OBSERVED_SHARE
 from ..build import build_estimator, build_recording, build_scene
 
 Array = NDArray[np.float64]
-Draw = Callable[[dict[str, list[dict[str, Any]]]], object]
 Numbers = NDArray[np.int64]
 
 NYU_PROTOCOL = (
@@ -100,7 +99,7 @@ def evaluate_nyu(
     reference: str | Path,
     *,
     model: str | None = None,
-    draw: Draw | None = None,
+    figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Errors on NYU hand data of published results and of ours, by both root protocols.
@@ -109,7 +108,7 @@ def evaluate_nyu(
         reference: folder with `nyu_test_14joints.npz` (labels and results) or `joint_data.mat`
             (labels), and any of the frames `depth_1_NNNNNNN.png`.
         model: name or path of a hand model; None means the bundled one.
-        draw: called with `shown_hands`, to draw a figure.
+        figure: PNG of Fig. 12 of Lie-X; None draws none.
         progress: called frame by frame.
 
     Returns:
@@ -124,8 +123,9 @@ def evaluate_nyu(
     labels = NyuReference.load(folder)
     numbers = frame_numbers_in(folder, len(labels.truth))
     ours, points = _ours(folder, labels.truth, numbers, model, progress)
-    if draw is not None:
-        draw(shown_hands(labels, numbers, points))
+    if figure is not None:
+        title = "NYU test frames, 14 points: labels, blue; answer, red"
+        draw_poses(title, shown_hands(labels, numbers, points), figure)
     published, same = {}, {}
     for name, answer in labels.answers.items():
         errors = nyu_errors(answer, labels.truth)

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from liex_lab.dashboards.report.report import write_report
 
 from liex_lab.behaviour.summary import measure_rows, stated_by
 from liex_lab.body.skeleton import Skeleton
@@ -34,20 +35,17 @@ from liex_lab.runtime.memory import peak_memory_mb, rest
 from liex_lab.runtime.processes import Done, Processes, Work
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Provenance, Session, SessionWriter, cutouts, evidence, mcap, rrd
-from liex_lab.sessions.writer import ReportMaker
 from liex_lab.tables.rows import Rows, stop_times
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Subject
 
 from ..build import build_provenance, build_recording, build_tracker, kept_estimator
-from ..session import CHUNK, Shard, conclude, measure_shards
+from ..session import CHUNK, Shard, conclude, measure_shards, run_session
 from ..study.cluster import crew_of
 from ..study.status import standings
 from . import speed
 from .speed import FPS, STEP_NS, as_mcap, evaluate_kinds, isolated, looped, to_and_fro
-
-RunSession = Callable[..., Path]
 
 _VIRTUAL = "synthetic:walk?seed={seed}&frames={n}&sensor={sensor}"
 _WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
@@ -92,16 +90,12 @@ DEFINITIONS = {
 }
 
 
-def evaluate_scale(
-    run: RunSession,
-    n_frames: int = 3000,
-    minutes: tuple[float, ...] = (1.0, 10.0),
-    progress: Progress = silent,
+def run_scale(
+    n_frames: int = 3000, minutes: Sequence[float] = (1.0, 10.0), *, progress: Progress = silent
 ) -> dict[str, Any]:
-    """Stages of a session, two workers against one, memory by length, and simulated many workers.
+    """Measure the cost of a study: sessions per hour, memory, and time by step.
 
     Args:
-        run: measures a recording, `liex_lab.api.run_session`.
         n_frames: frames of each virtual recording, 640 x 480; several shards long.
         minutes: lengths of recording whose memory is measured, minutes.
         progress: called with the stage, of six.
@@ -119,11 +113,11 @@ def evaluate_scale(
         progress(1, 6, "making recordings")
         walks = [_walk(folder / "rawdata", k, n_frames) for k in range(2)]
         progress(2, 6, "measuring the stages of a session")
-        stages = _stages(run, walks[0], folder)
+        stages = _stages(walks[0], folder)
         progress(3, 6, "measuring one recording by one process and by two")
         shards = _side_by_side(walks[0], folder)
         progress(4, 6, "measuring a study by one worker and by two")
-        study, seconds_each, scheduler_s = _workers(run, walks, folder)
+        study, seconds_each, scheduler_s = _workers(walks, folder)
         progress(5, 6, "measuring memory by length")
         memory = {
             f"{length:g} min": isolated(
@@ -152,13 +146,13 @@ def _walk(folder: Path, seed: int, n_frames: int) -> Path:
         return as_mcap(looped(short, n_frames, f"walk{seed}"), folder)
 
 
-def _stages(run: RunSession, recording: Path, folder: Path) -> dict[str, Any]:
+def _stages(recording: Path, folder: Path) -> dict[str, Any]:
     """Time of each stage of a session, after a first session has compiled everything."""
     plan = Plan.load("mouse")
-    run(recording, plan, folder / "warm")
+    run_session(recording, plan, folder / "warm")
     kept_estimator.cache_clear()  # a single run has to load its model
     began = time.perf_counter()
-    session = Session.open(run(recording, plan, folder / "measured"))
+    session = Session.open(run_session(recording, plan, folder / "measured"))
     whole = time.perf_counter() - began
     n = session.metadata["frames"]["n_frames"]
     spent = session.metadata["timings_s"]
@@ -278,9 +272,7 @@ def _on_cores(n: int) -> Iterator[None]:
             os.sched_setaffinity(0, before)
 
 
-def _workers(
-    run: RunSession, walks: list[Path], folder: Path
-) -> tuple[dict[str, Any], list[float], float]:
+def _workers(walks: list[Path], folder: Path) -> tuple[dict[str, Any], list[float], float]:
     """Elapsed time of the same sessions on one worker and on two.
 
     Returns:
@@ -300,7 +292,7 @@ def _workers(
         began = time.perf_counter()
         todo = standings(study)
         with _on_cores(n_cores), crew_of(len(todo), workers=count, threads=1) as crew:
-            results = crew.measure(todo, run)
+            results = crew.measure(todo, run_session)
         wall[name] = time.perf_counter() - began
         each[name] = [result["seconds"] for result in results]
         shutil.rmtree(folder / "derivatives" / f"w{k}")
@@ -338,13 +330,8 @@ def simulate(
     return found
 
 
-def write_long(
-    minutes: float,
-    out: str | Path,
-    report: ReportMaker | None = None,
-    reached: Callable[[str], None] = lambda what: None,
-) -> dict[str, Any]:
-    """Write a session of so many minutes and return its cost.
+def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
+    """Write a session of a virtual mouse of any length; returns its cost in memory and time.
 
     Frames of a short recording are repeated forwards and backwards. Every frame is written, tracked
     and measured as in `liex run`; only its observations are copied from the short recording's
@@ -353,8 +340,6 @@ def write_long(
     Args:
         minutes: length of the session.
         out: folder in which `long.liex` is written.
-        report: makes the report, see `SessionWriter`.
-        reached: called with the stage: `began`, `written`, `tracked`, `closed`.
 
     Returns:
         `peak_memory_mb` of the process and `seconds`.
@@ -364,19 +349,15 @@ def write_long(
     depth, observed, subject, origin = _measure_short(plan)
     origin = replace(origin, n_frames=n)
     rest()
-    reached("began")
     began = time.perf_counter()
-    with SessionWriter(Path(out) / "long.liex", origin, report=report) as writer:
+    with SessionWriter(Path(out) / "long.liex", origin, report=write_report) as writer:
         for frames, part in _parts(depth, observed, n):
             writer.add(frames, observations=part)
-        reached("written")
         whole = writer.observations(Observations)
         track = track_whole(subject, whole, allocate=writer.allocate)
         writer.take(track, whole, subject)
         del whole, track
-        reached("tracked")
         conclude(writer, plan, {"prepare": 0.0, "track": 0.0})
-    reached("closed")
     return {"peak_memory_mb": peak_memory_mb(), "seconds": time.perf_counter() - began}
 
 

@@ -8,11 +8,12 @@ test and no development.
 
 import hashlib
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from liex_lab.dashboards.paper.figures import draw_scene
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, MisfitError
@@ -23,7 +24,6 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import verdict_in
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, film
-from liex_lab.simulation.scenes.stage import TrueAnimal
 
 from ..arenas import run_arenas
 from ..build import plan_of, propose_arenas
@@ -35,7 +35,6 @@ Array = NDArray[np.float64]
 SEEDS: Final = tuple(range(1001, 1013))
 # not 931_507_211 to 213, whose results have influenced development
 SEALED_SEEDS: Final = (958_204_331, 958_204_332, 958_204_333)
-N_FRAMES: Final = 300
 
 
 Case = tuple[
@@ -43,9 +42,6 @@ Case = tuple[
 ]  # scene, bundled plan, and the row its error is divided by ('' for none)
 # individuals of all sessions that were written, problems or the sentence of a refusal, exit code
 Outcome = tuple[list[MeasuredIndividual], list[str], int]
-Draw = Callable[
-    [str, "TrueRecording", Sequence["TrueAnimal"], Sequence[MeasuredIndividual]], object
-]
 
 
 def cases() -> dict[str, Case]:
@@ -64,13 +60,13 @@ def cases() -> dict[str, Case]:
 def evaluate_scenes(
     only: Sequence[str] = (),
     *,
-    n_frames: int = N_FRAMES,
+    n_frames: int = 300,
     n_recordings: int = 1,
     sealed: bool = False,
-    draw: Draw | None = None,
+    pictures: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Results of each scene; `liex evaluate scenes`.
+    """Measure rendered scenes that mimic lab recordings, and score the tables.
 
     Args:
         only: names of rows; () uses all. A row's reference row is measured, too.
@@ -78,8 +74,7 @@ def evaluate_scenes(
         n_recordings: of each scene, each of another seed and animal; the first is of a build that
             no model was trained on, the second of one like the training's.
         sealed: measure on the sealed seeds, which are not for development.
-        draw: called with each row's name, first recording, truth and measured individuals, to draw
-            a figure.
+        pictures: folder of drawn frames, a PNG for each row; None draws none.
         progress: called row by row.
 
     Returns:
@@ -101,7 +96,7 @@ def evaluate_scenes(
     rows: dict[str, dict[str, Any]] = {}
     for k, name in enumerate(names):
         progress(k, len(names), f"scene {name}")
-        rows[name] = _measure_row(name, every[name], seeds[:n_recordings], n_frames, draw)
+        rows[name] = _measure_row(name, every[name], seeds[:n_recordings], n_frames, pictures)
         beside = rows.get(every[name][2], {}).get("mean_joint_error_mm")
         own = rows[name]["mean_joint_error_mm"]
         rows[name]["ratio_to_plain"] = own / beside if own and beside else None
@@ -114,7 +109,7 @@ def evaluate_scenes(
 
 
 def _measure_row(
-    name: str, case: Case, seeds: Sequence[int], n_frames: int, draw: Draw | None
+    name: str, case: Case, seeds: Sequence[int], n_frames: int, pictures: Path | None
 ) -> dict[str, Any]:
     """Results of one row over some recordings."""
     scene, of_plan, _ = case
@@ -133,8 +128,8 @@ def _measure_row(
         tally.add(truths, individuals, n_frames, skeleton.tip, fits)
         said += [sentence for sentence in sentences if sentence not in said]
         exit_code = max(exit_code, code)
-        if draw is not None and k == 0:
-            draw(name, recording, truths, individuals)
+        if pictures is not None and k == 0:
+            draw_scene(name, recording, truths, individuals, pictures)
     return {**tally.figures(), "said": said, "exit_code": exit_code}
 
 

@@ -30,6 +30,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from liex_lab.dashboards.paper.figures import draw_tracking
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
@@ -51,7 +52,6 @@ from ..build import build_scene, plan_of
 from ..training.pose_model import estimator_of
 
 Array = NDArray[np.float64]
-Draw = Callable[[simulator.TestSequence, dict[str, Followed]], object]
 
 ROWS = {
     "single": "single frames",
@@ -87,10 +87,10 @@ def evaluate_tracking(
     paper: bool = False,
     seed: int | None = None,
     n_frames: int | None = None,
-    draw: Draw | None = None,
+    figure: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """The tracking errors of a fixed sequence; `liex evaluate tracking`.
+    """Compare single frames, Lie-X Algorithm 3 and the default tracker on a fixed sequence.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
@@ -100,7 +100,7 @@ def evaluate_tracking(
             trained if needed.
         seed: of another sequence of the same kind; None means the fixed one.
         n_frames: length of the sequence; None means the usual one.
-        draw: called with the sequence and its rows, to draw a figure.
+        figure: PNG of the joint errors over time; None draws none.
         progress: called chunk by chunk.
 
     Returns:
@@ -131,8 +131,8 @@ def evaluate_tracking(
     }
     if paper:
         result["notes"] = [comparison(table, estimator.skeleton.name)]
-    if draw is not None:
-        draw(recording, rows)
+    if figure is not None:
+        draw_tracking(recording, rows, figure)
     return result
 
 

@@ -3,8 +3,6 @@
 `liex train tracking` measures sequences of the kinds used for evaluation, with other seeds, once
 frame by frame. These fits follow on the observations:
 
-- An optional random search (hill climbing): up to three parameters of association and motion are
-  multiplied by log-normal factors, sd 0.5, and kept if the tracks come closer to the truth.
 - Calibration factors of the joints (`calibration`) at three levels of the stated error, by
   bisection, together with the standard deviation of the body's stretch over a grid of two
   coefficients, so that nine errors in ten lie within the 90 % interval, over all sequences and in
@@ -18,7 +16,7 @@ Everything starts from fixed seeds, so `tunings.toml` is byte-identical on every
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -30,17 +28,16 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.evaluation.scores import Followed
 from liex_lab.geometry import SE3, so3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation import corruptions, simulator
+from liex_lab.simulation import simulator
 from liex_lab.simulation.recording import TrueRecording
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.smoother import TrackingParameters, tunings_with
 from liex_lab.tracking.track import Subject, Track
-from liex_lab.tracking.track_rows import single_frames, stretch_of
+from liex_lab.tracking.track_rows import stretch_of
 from liex_lab.tracking.tracker import FrameTracker
 
 from ..build import build_scene, plan_of
@@ -52,8 +49,6 @@ Knots = tuple[tuple[float, float], ...]
 SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
 BUILD_SEEDS = tuple(range(201, 230))  # of animals of other builds
 _BUILD_FRAMES = 120
-_EASY_WEIGHT = 2.0  # a track must not be worse than single frames where these are good
-_STEP = 0.5  # sd of the logarithm of a changed parameter
 _BINS = 3
 _Z90 = 1.645
 _FACTORS = (0.3, 3.0)
@@ -62,18 +57,6 @@ _LEAST = 0.01
 # grids of the stretch's coefficients, see `MotionParameters.stretch`
 _PER_BLUR = np.arange(0.0, 6.5, 0.5)
 _PER_SPREAD = np.arange(0.0, 3.5, 0.5)
-_FOUND_OTHERWISE = (
-    "ceiling",
-    "correlated_share",
-    "calibration",
-    "stretch",
-    "usual_stretch",
-    "unseen_height",
-    "unseen_shift",
-    "root_calibration",
-    "bend_calibration",
-    "joint_calibration",
-)
 _CHUNK = 32
 
 
@@ -87,7 +70,6 @@ class Measured:
         subject: the animal and its camera.
         pose: (n) true poses, in the same arena frame.
         truth: (n, J, 3) true joints, mm, in the same arena frame.
-        events: events of the sequence, such as occlusions.
         blur: median distance of body and depth over the body's length, see `FrameTracker`.
         size_spread: standard deviation of the log size estimated by frame, see `FrameTracker`.
     """
@@ -97,26 +79,14 @@ class Measured:
     subject: Subject
     pose: Pose
     truth: Array
-    events: Sequence[corruptions.Event]
     blur: float
     size_spread: float
-
-    def errors(self, joints: Array) -> Array:
-        """Errors (m,) over the length of the frames in view, as in `in_view_ratio`.
-
-        Args:
-            joints: (n, J, 3) joints of a track, mm, arena frame; NaN without a pose, which has an
-                error of half the length.
-        """
-        length = self.subject.length_mm
-        return Followed(joints, self.truth, joints, 1.0).in_view(self.events, length) / length
 
 
 def train_tracking(
     animal: str,
     out: Path,
     *,
-    n_tries: int = 0,
     n_frames: int | None = None,
     seeds: Sequence[int] = (),
     workers: int = 0,
@@ -124,13 +94,11 @@ def train_tracking(
 ) -> Path:
     """Write `tunings.toml` with an animal's table fitted again; byte-identical on every run.
 
-    Association and motion are those of the file, or the best of `n_tries` changes of them; the
-    calibration of errors is always fitted again.
+    Association and motion are those of the file; the calibration of errors is fitted again.
 
     Args:
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         out: path of the file to write; the other animals' tables are copied unchanged.
-        n_tries: steps of the random search; 0 leaves association and motion unchanged.
         n_frames: frames of each sequence; None means its usual length.
         seeds: of the sequences, instead of `SEEDS`.
         workers: threads of the kernels; 0 means all.
@@ -146,10 +114,8 @@ def train_tracking(
         for kind, usual in SEEDS.items()
         for seed in seeds or usual
     ]
-    tuning = search(
-        measured, TrackingParameters.of(animal), n_tries, np.random.default_rng(0), progress
-    )
-    tuning = calibrate_roots(measured, calibrate_joints(measured, tuning))
+    tuning = calibrate_joints(measured, TrackingParameters.of(animal))
+    tuning = calibrate_roots(measured, tuning)
     builds = other_builds(animal, progress, seeds or BUILD_SEEDS)
     tuning = calibrate_each_joint([*measured, *builds], calibrate_builds(builds, tuning))
     out.write_text(tunings_with(animal, tuning), encoding="utf-8")
@@ -175,7 +141,7 @@ def measure(
         simulator.world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
     )
     estimator = estimator_of(animal, "default", progress)
-    return observed(estimator, plan_of(animal), kind, recording, recording.events, progress)
+    return observed(estimator, plan_of(animal), kind, recording, progress)
 
 
 def other_builds(
@@ -197,7 +163,7 @@ def other_builds(
     estimator = estimator_of(animal, "default", progress)
     plan = plan_of(animal)
     recordings = [world.motion([seed], _BUILD_FRAMES, family="other") for seed in seeds]
-    return [observed(estimator, plan, "other", one, (), progress) for one in recordings]
+    return [observed(estimator, plan, "other", one, progress) for one in recordings]
 
 
 def observed(
@@ -205,7 +171,6 @@ def observed(
     plan: Plan,
     kind: str,
     recording: TrueRecording,
-    events: Sequence[corruptions.Event] = (),
     progress: Progress = silent,
 ) -> Measured:
     """Measure a rendered recording frame by frame; background and size are estimated as in a run.
@@ -215,7 +180,6 @@ def observed(
         plan: thresholds of the foreground, and expected sizes.
         kind: label of the recording, see `Measured`.
         recording: with its truth.
-        events: events of the recording.
         progress: called frame by frame.
 
     Raises:
@@ -237,112 +201,13 @@ def observed(
         tracker.subject,
         pose,
         T @ recording.joints_arena,
-        events,
         tracker.blur,
         tracker.size_spread,
     )
 
 
-def search(
-    measured: Sequence[Measured],
-    tuning: TrackingParameters,
-    n_tries: int,
-    rng: np.random.Generator,
-    progress: Progress = silent,
-) -> TrackingParameters:
-    """The best tuning of a random search; a step changes up to three parameters of the best so far.
-
-    Args:
-        measured: the sequences.
-        tuning: where the search starts.
-        n_tries: number of steps.
-        rng: random number generator.
-        progress: called with the step and the cost.
-
-    Returns:
-        The tuning with the least cost; `tuning` itself if nothing is better.
-    """
-    alone = {kind: _of_kind(measured, kind, None) for kind in SEEDS}
-    best = _cost(measured, alone, tuning)
-    for tried in range(n_tries):
-        progress(tried, n_tries, f"searching; the cost is {best:.3f}")
-        other = tuning
-        for _ in range(rng.integers(1, 4)):
-            other = changed(other, rng)
-        cost = _cost(measured, alone, other)
-        if cost < best:
-            best = cost
-            tuning = other
-    return tuning
-
-
-def changed(tuning: TrackingParameters, rng: np.random.Generator) -> TrackingParameters:
-    """The tuning with one parameter multiplied by a log-normal factor, sd of the logarithm 0.5.
-
-    Parameters that are fitted separately (`_FOUND_OTHERWISE`, such as the calibration factors)
-    stay.
-
-    Args:
-        tuning: what is changed; of association in 35 % of the cases, else of motion.
-        rng: random number generator for the parameter and the factor.
-    """
-    factor = float(np.exp(rng.normal(0.0, _STEP)))
-    part = "chain" if rng.random() < 0.35 else "motion"
-    values: Any = getattr(tuning, part)
-    names = [field.name for field in fields(values) if field.name not in _FOUND_OTHERWISE]
-    name = str(rng.choice(names))
-    return replace(
-        tuning, **{part: replace(values, **{name: _scaled(getattr(values, name), factor, rng)})}
-    )
-
-
-def _scaled(value: Any, factor: float, rng: np.random.Generator) -> Any:
-    """A number times the factor, or a tuple or dataclass with one of its numbers scaled."""
-    if isinstance(value, tuple):
-        at = int(rng.integers(len(value)))
-        return tuple(
-            _scaled(each, factor, rng) if k == at else each for k, each in enumerate(value)
-        )
-    if isinstance(value, float | int):
-        return value * factor
-    name = str(rng.choice([field.name for field in fields(value)]))
-    return replace(value, **{name: getattr(value, name) * factor})
-
-
-def _of_kind(measured: Sequence[Measured], kind: str, tuning: TrackingParameters | None) -> Array:
-    """Errors over all sequences of a kind, of single frames if `tuning` is None."""
-    return np.concatenate(
-        [
-            each.errors(
-                single_frames(each.subject, each.observations).joints_mm
-                if tuning is None
-                else _track(each, tuning).joints_mm
-            )
-            for each in measured
-            if each.kind == kind
-        ]
-    )
-
-
 def _track(each: Measured, tuning: TrackingParameters | None) -> Track:
     return track_whole(each.subject, each.observations, (), tuning).track
-
-
-def _cost(
-    measured: Sequence[Measured], alone: dict[str, Array], tuning: TrackingParameters
-) -> float:
-    """Cost of a tuning: its errors over those of single frames, in four statistics.
-
-    It is the sum of the ratios of mean, median, 75 % and 95 % quantile; easy sequences have a
-    weight of 2, since a track must not be worse than single frames where these are good.
-    """
-    total = 0.0
-    for kind, weight in (("easy", _EASY_WEIGHT), ("hard", 1.0)):
-        error, others = _of_kind(measured, kind, tuning), alone[kind]
-        of = [error.mean() / others.mean()]
-        of += [float(np.quantile(error, q) / np.quantile(others, q)) for q in (0.5, 0.75, 0.95)]
-        total += weight * float(np.sum(of))
-    return total
 
 
 def with_motion(tuning: TrackingParameters, **changes: Any) -> TrackingParameters:

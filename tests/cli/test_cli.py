@@ -239,7 +239,7 @@ CALLS: list[tuple[str, str, Any, tuple[Any, ...], dict[str, Any], str]] = [
         "evaluation.scenes.evaluate_scenes",
         {"rows": {"plain": SCENE}, "protocol": "found: share"},
         (["plain", "raised"],),
-        {"n_frames": 60, "n_recordings": 1, "sealed": False, "draw": None},
+        {"n_frames": 60, "n_recordings": 1, "sealed": False, "pictures": None},
         "| plain | 0.988 | – | look here; and here |",
     ),
     (

@@ -22,7 +22,7 @@ from liex_lab.dashboards.report.contact_sheet import (
     thumbnails,
     whole_image,
 )
-from liex_lab.dashboards.video.relief import Relief, scale_mm
+from liex_lab.dashboards.video.film import Relief, scale_mm
 
 from liex_lab.sessions import Session
 from tests.dashboards.conftest import HOUSE

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from liex_lab.dashboards.report.facts import methods, refusal_rows
+from liex_lab.dashboards.report.report import methods, refusal_rows
 
 from liex_lab.actions.vocabulary import WORDS
 from liex_lab.sessions import Session

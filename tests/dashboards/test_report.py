@@ -9,8 +9,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.dashboards.report.facts import beside_average, frame_account, methods, warnings
-from liex_lab.dashboards.report.report import render, write_report
+from liex_lab.dashboards.report.report import (
+    beside_average,
+    frame_account,
+    methods,
+    render,
+    warnings,
+    write_report,
+)
 
 from liex_lab.actions import vocabulary
 from liex_lab.behaviour import measure_session

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.report.report import write_report
 from liex_lab.dashboards.video import video
-from liex_lab.dashboards.video.film import Film, View
-from liex_lab.dashboards.video.relief import Relief, scale_mm
+from liex_lab.dashboards.video.film import Film, Relief, View, scale_mm
 from liex_lab.dashboards.video.video import matches
 
 from liex_lab.api import export_video

@@ -22,11 +22,12 @@ from pathlib import Path
 from typing import Any, cast
 
 import numba
+from liex_lab.dashboards.paper.page import write_paper
 
 from liex_lab.actions.storage import load_action_model
 from liex_lab.baselines.cnn import CnnPlan, require_torch
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.catalog import kept_results_folder
+from liex_lab.catalog import bundled_models, kept_results_folder
 from liex_lab.errors import LiexError, MissingPackageError, PlanError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import method_of
@@ -132,9 +133,9 @@ class Budget:
         )
 
 
-def measure_paper(
+def run_tables(
     out: str | Path,
-    animals: Sequence[str],
+    animals: Sequence[str] = (),
     *,
     n_frames: int | None = None,
     quick: bool = False,
@@ -144,12 +145,13 @@ def measure_paper(
     without: Sequence[str] = (),
     nyu: Path | None = None,
     progress: Progress = silent,
-) -> tuple[list[dict[str, Any]], dict[str, Any], list[Path]]:
-    """Measure the contents of the tables and figures; write the numbers into a folder.
+) -> list[Path]:
+    """Make every table and figure of the Lie-X paper on one page; returns the files written.
 
     Args:
-        out: the folder for results.json and kept/ANIMAL.json; it is created if missing.
-        animals: names of bundled animals.
+        out: the output folder; it is created if missing. Results are in results.json, the rows to
+            keep in kept/ANIMAL.json.
+        animals: names of bundled animals; () means all that have a bundled model.
         n_frames: frames of each split, of which every row is then measured; None means all.
         quick: few frames, every row trained on very little data.
         fresh: train and measure rows now instead of using kept results.
@@ -160,10 +162,6 @@ def measure_paper(
         nyu: folder of the NYU hand data, for Table 2; None leaves it out.
         progress: called with the progress of the job.
 
-    Returns:
-        The results by animal, see `results_of`; the results of other verbs, see `measure_further`;
-        and the files that were written.
-
     Raises:
         PlanError: there is no such row, or part.
         LiexError: kept results are damaged.
@@ -173,6 +171,7 @@ def measure_paper(
             f"there is no part '{unknown[0]}' to leave out; known are {', '.join(PARTS)}"
         )
     budget = Budget.of(n_frames, quick, fresh, rows, sealed)
+    animals = animals or list(bundled_models())
     command = _command(animals, n_frames, quick, fresh, rows, sealed)
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -186,9 +185,9 @@ def measure_paper(
     path = folder / "results.json"
     text = json.dumps(plain(numbers), indent=1, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
-    further = measure_further(without, nyu, quick, progress)
+    further = measure_further(folder, without, nyu, quick, progress)
     progress(0, None, "drawing")
-    return results, further, [*written, path]
+    return [*written, path, *write_paper(folder, results, further, quick)]
 
 
 def _command(
@@ -439,6 +438,7 @@ def _quick_paper(animal: str) -> PoseEstimator:
 
 
 def measure_further(
+    folder: Path,
     without: Sequence[str] = (),
     nyu: Path | None = None,
     quick: bool = False,
@@ -447,21 +447,22 @@ def measure_further(
     """Results of other verbs, as small fixed measurements for the same page.
 
     Returns:
-        `tracking` (Fig. 18): the first frames of the easy mouse sequence, with `tracked`, the
-        sequence and its rows; `actions` (Figs. 19 and 20): the cut-out sequences of fish, with
-        `key_frames`; `nyu` (Table 2, Fig. 12), with `nyu_hands`; empty if left out; `missing`: by
-        part, why it was left out and which command makes it.
+        `tracking`: the first frames of the easy mouse sequence; `actions` (Figs. 19 and 20): the
+        cut-out sequences of fish, with `key_frames`; `nyu` (Table 2); empty if left out; `missing`:
+        by part, why it was left out and which command makes it; `figures`: Figs. 12 and 18 in the
+        folder.
     """
-    further: dict[str, Any] = {"tracking": {}, "actions": {}, "nyu": {}, "nyu_hands": {}}
+    further: dict[str, Any] = {"tracking": {}, "actions": {}, "nyu": {}, "figures": []}
     further["missing"] = {name: f"it was left out; `{_VERBS[name]}` makes it" for name in without}
     if "tracking" not in without:
         further["tracking"] = evaluate_tracking(
             "mouse",
             "easy",
             n_frames=_QUICK_TRACKED if quick else _TRACKED_FRAMES,
-            draw=lambda *shown: further.update(tracked=shown),
+            figure=folder / "fig18_tracking.png",
             progress=progress,
         )
+        further["figures"].append(folder / "fig18_tracking.png")
     if "actions" not in without:
         further["actions"] = _actions("fish", _QUICK_STRIDE if quick else 1, progress)
         further["key_frames"] = rows.acted_key_frames("fish")
@@ -469,8 +470,8 @@ def measure_further(
         why = f"no folder was named with --nyu; with the data `{_VERBS['nyu']}` makes it"
         further["missing"]["nyu"] = why
     else:
-        draw = further["nyu_hands"].update
-        further["nyu"] = evaluate_nyu(nyu, draw=draw, progress=progress)
+        further["figures"].append(folder / "fig12_nyu_hands.png")
+        further["nyu"] = evaluate_nyu(nyu, figure=further["figures"][-1], progress=progress)
     return further
 
 

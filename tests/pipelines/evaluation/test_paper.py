@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from liex_lab.dashboards.paper import figures, page
+from liex_lab.dashboards.paper import page
 from liex_lab.dashboards.paper.published import DEVIATIONS
 from liex_lab.pipelines.build import plan_of
 from liex_lab.pipelines.evaluation.paper import rows, run
@@ -95,11 +95,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(rows, "sensitivity", toy_curve)
         patch.setattr(rows, "_RATE_FRAMES", 4)
         patch.setattr(rows, "_RATE_REPEATS", 1)
-        results, further, kept = run.measure_paper(
-            out, ["mouse"], quick=True, n_frames=2 * N_FRAMES, without=PARTS
-        )
-        written = page.write_paper(out, results, further, quick=True)
-    assert all(path.is_file() for path in (*kept, *written))
+        written = run.run_tables(out, ["mouse"], quick=True, n_frames=2 * N_FRAMES, without=PARTS)
+    assert all(path.is_file() for path in written)
     return out
 
 
@@ -214,9 +211,9 @@ def test_every_row_measures_the_object_that_the_default_chooses():
 
 def test_a_part_or_row_that_does_not_exist_is_refused_before_anything_is_measured(tmp_path):
     with pytest.raises(PlanError, match=r"no part 'speed'.*tracking, actions"):
-        run.measure_paper(tmp_path / "out", ["mouse"], without=["speed"])
+        run.run_tables(tmp_path / "out", ["mouse"], without=["speed"])
     with pytest.raises(PlanError, match="no row 'knn'"):
-        run.measure_paper(tmp_path / "out", ["mouse"], rows=["knn"])
+        run.run_tables(tmp_path / "out", ["mouse"], rows=["knn"])
     assert not (tmp_path / "out").exists()
 
 
@@ -382,10 +379,8 @@ def from_kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(run, "_tests", no_recordings)
         patch.setattr(rows, "illustrate", lambda *_: {})
         patch.setattr(rows, "shown_poses", lambda _, poses, __: {name: [] for name in poses})
-        patch.setattr(figures, "draw_paper", lambda *_: [])
         patch.setattr(page, "draw_paper", lambda *_: [])
-        results, further, _ = run.measure_paper(out, ["mouse", "fish", "hand"], without=PARTS)
-        page.write_paper(out, results, further, quick=False)
+        run.run_tables(out, ["mouse", "fish", "hand"], without=PARTS)
     return out
 
 

@@ -2,13 +2,12 @@
 picture of it.
 """
 
-from functools import partial
 from itertools import pairwise
 from unittest.mock import patch
 
 import numpy as np
 import pytest
-from liex_lab.dashboards.paper.figures import draw_tracking, worst_moments
+from liex_lab.dashboards.paper.figures import worst_moments
 from liex_lab.pipelines.evaluation import tracking
 from liex_lab.pipelines.evaluation.tracking import PAPER_ROWS, ROWS, _pattern_search, comparison
 
@@ -30,9 +29,8 @@ def test_the_smoothed_track_is_better_than_its_frames_and_the_paper_s_algorithms
     )
     monkeypatch.setattr(tracking, "_AGAIN", 1)
     figure = tmp_path / "figure.png"
-    draw = partial(draw_tracking, path=figure)
     result = tracking.evaluate_tracking(
-        "mouse", "hard", seed=21, n_frames=40, paper=True, draw=draw
+        "mouse", "hard", seed=21, n_frames=40, paper=True, figure=figure
     )
     rows = result["rows"]
     assert list(rows) == list(ROWS) == list(result["row_names"])
