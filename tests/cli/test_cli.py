@@ -49,16 +49,14 @@ def test_help_is_quick() -> None:
     """
     liex("--help")  # the first call writes the byte code
     walls = []
-    for _ in range(3):
+    for _ in range(2):
         begin = time.perf_counter()
         assert liex("--help").returncode == 0
         walls.append(time.perf_counter() - begin)
     assert min(walls) < 1.0, f"liex --help took {min(walls):.2f} s"
 
 
-@pytest.mark.parametrize(
-    "words", [[], *([verb] for verb in VERBS), *(["evaluate", name] for name in MEASURES)]
-)
+@pytest.mark.parametrize("words", [[], ["evaluate"], ["run"], ["train"], ["evaluate", "tables"]])
 def test_every_verb_explains_itself(words: list[str]) -> None:
     result = CliRunner().invoke(cli.app, [*words, "--help"])
     assert result.exit_code == 0, result.output
@@ -83,10 +81,6 @@ def test_the_list_of_verbs_is_whole_on_a_narrow_screen_and_each_begins_with_a_ve
     assert len(begun) >= 6
     assert set(begun) <= IMPERATIVES, set(begun) - IMPERATIVES
     assert "..." not in lists
-
-
-def test_it_says_which_version_it_is() -> None:
-    assert CliRunner().invoke(cli.app, ["--version"]).output == f"liex_lab {liex_lab.__version__}\n"
 
 
 def test_python_m_is_the_same_command() -> None:
@@ -190,14 +184,6 @@ def test_run_ends_with_how_it_went_and_exit_code_4_where_someone_has_to_look(
     last = result.output.strip().splitlines()[-1]
     assert last.startswith("result:  9 frames, 8 with a pose (89%), 7 of them trusted")
     assert ("look at it" in last) == bool(reasons)
-
-
-def test_demo_ends_with_the_path_of_a_session(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("liex_lab.api.run_demo", lambda out, progress: out / "sample.liex")
-    result = CliRunner().invoke(cli.app, ["demo", "--out", str(tmp_path)])
-    assert f"session: {tmp_path / 'sample.liex'}" in result.output
 
 
 def test_doctor_prints_json_that_holds_no_nan(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -380,16 +366,6 @@ def test_the_help_of_the_tables_says_in_what_they_differ_from_the_paper() -> Non
     told = " ".join(CliRunner().invoke(cli.app, ["evaluate", "tables", "--help"]).output.split())
     for sentence in DEVIATIONS:
         assert sentence in told
-
-
-@pytest.mark.parametrize(("n", "counted"), [(1, "1 file"), (2, "2 files")])
-def test_files_are_counted_in_the_singular_and_plural(
-    n: int, counted: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = {"files": ["a.svg"] * n, "empty": [], "folder": "there"}
-    monkeypatch.setattr(api, "draw_figures", lambda *_, **__: drawn)
-    result = CliRunner().invoke(cli.app, ["figures", "NAME.liex"])
-    assert result.output == f"figures: {counted} in there\n"
 
 
 def test_info_tells_versions_and_plans_and_prints_a_plan_to_copy() -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from liex_lab import cli
-from tests.cli.test_cli import liex
 from tests.recordings.writers import (
     cut,
     depth_frames,
@@ -163,11 +162,3 @@ def test_a_place_that_is_a_file_is_told_before_any_work(
     (tmp_path / "r.liex").write_text("mine")
     sentence = refused(capsys, monkeypatch, "run", str(whole(tmp_path)), "--out", str(tmp_path))
     assert "is not a session, so it is left alone" in sentence
-
-
-def test_a_mistake_in_a_process_of_its_own(tmp_path: Path) -> None:
-    ran = liex("run", str(RECORDINGS["cut .mcap"][0](tmp_path)), "--out", str(tmp_path / "results"))
-    assert (ran.returncode, ran.stdout) == (1, "")
-    assert "whole frames can be read from it; copy it again" in ran.stderr
-    assert len(ran.stderr.strip().splitlines()) == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["r.mcap"]

@@ -43,7 +43,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "report.html"
 
 
-@pytest.mark.parametrize("width", [360, 1000])
+@pytest.mark.parametrize("width", [360, pytest.param(1000, marks=pytest.mark.nightly)])
 def test_the_report_fits_a_phone_and_a_screen(report: Path, width: int, watched: Watched) -> None:
     watched.page.set_viewport_size({"width": width, "height": 800})
     watched.page.goto(report.as_uri())
@@ -53,6 +53,7 @@ def test_the_report_fits_a_phone_and_a_screen(report: Path, width: int, watched:
     watched.nothing_went_wrong()
 
 
+@pytest.mark.nightly
 def test_the_report_can_be_printed(report: Path, watched: Watched) -> None:
     page = watched.page
     page.set_viewport_size({"width": _A4_PX, "height": 1000})

@@ -18,7 +18,6 @@ from liex_lab.dashboards.report.contact_sheet import (
     Mark,
     image_svg,
     scene_marks,
-    shade,
     thumbnails,
     whole_image,
 )
@@ -131,11 +130,3 @@ def test_a_cut_out_has_its_skeleton_and_the_marks_within_it() -> None:
     assert 'class="hidden"' not in svg
     assert "M4.0 5.5H5.0M4.5 5.0V6.0" in svg
     assert "<b>" not in svg
-
-
-def test_near_is_light_and_unread_is_grey() -> None:
-    depth = np.array([[700, 700, 700, 700], [700, 650, 650, 0]], np.uint16)
-    rgb = shade(depth, 80.0).astype(int)
-    assert rgb[1, 1].sum() > rgb[0, 0].sum()
-    assert rgb[1, 3].tolist() == [90, 90, 90]
-    assert (shade(0 * depth, 80.0) == 90).all()

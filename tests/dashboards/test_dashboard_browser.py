@@ -130,6 +130,7 @@ def reached_by_keyboard(page: Page) -> None:
     assert unnamed == []
 
 
+@pytest.mark.nightly
 def test_the_line_through_the_whole_session_follows_the_moment_and_a_drag_enlarges(
     served: Served, watched: Watched
 ) -> None:
@@ -169,6 +170,7 @@ def test_the_line_through_the_whole_session_follows_the_moment_and_a_drag_enlarg
     watched.nothing_went_wrong()
 
 
+@pytest.mark.nightly
 def test_a_person_corrects_by_sentences_and_takes_one_back(
     served: Served, watched: Watched
 ) -> None:

@@ -227,6 +227,7 @@ def to_nose(served: Served) -> np.ndarray:
     return np.asarray(poses.loc["nose"].to_numpy() - poses.loc["rump"].to_numpy())
 
 
+@pytest.mark.nightly
 def test_f_exchanges_head_and_tail_in_the_marked_span_and_u_takes_it_back(
     tracked: Served, watched: Watched
 ) -> None:
@@ -270,6 +271,7 @@ def test_f_exchanges_head_and_tail_in_the_marked_span_and_u_takes_it_back(
     watched.nothing_went_wrong()
 
 
+@pytest.mark.nightly
 def test_it_plays_at_the_pace_that_is_asked_for(served: Served, watched: Watched) -> None:
     page, asked = watched.page, list[str]()
     page.on("request", lambda request: asked.append(request.url.removeprefix(served.address)))
@@ -312,6 +314,7 @@ def test_it_plays_at_the_pace_that_is_asked_for(served: Served, watched: Watched
     watched.nothing_went_wrong()
 
 
+@pytest.mark.nightly
 def test_doubts_and_crossings_are_gone_to_one_after_the_other_and_stay_so(
     served: Served, watched: Watched
 ) -> None:

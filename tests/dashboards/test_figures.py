@@ -17,8 +17,6 @@ from liex_lab.dashboards.figures.style import (
     image_bytes,
     joined,
     on_page,
-    scale_bar,
-    sheet,
 )
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
@@ -26,7 +24,6 @@ from matplotlib.text import Text
 
 from liex_lab.actions.vocabulary import action_colours
 from liex_lab.api import compare_groups, draw_figures
-from liex_lab.behaviour.cohort import compare
 from liex_lab.errors import PlaceError, SessionError
 from liex_lab.scene.scene import Arena
 from liex_lab.sessions import Session
@@ -89,14 +86,6 @@ def test_a_scale_bar_is_as_long_as_it_says(animal):
         paper = axes.transData.transform(np.column_stack(walls.get_data()))
         bar_px = np.ptp(axes.transData.transform(np.column_stack(bar.get_data()))[:, 0])
         assert np.ptp(paper[:, 0]) / bar_px == pytest.approx(2 * 220.0 / float(mm), rel=0.01)
-
-
-@pytest.mark.parametrize("extent", [30.0, 420.0, 1500.0, 9000.0])
-def test_a_scale_bar_fits_its_panel(extent):
-    with drawing():
-        axes = sheet(50.0, 50.0).subplots()
-        axes.set_xlim(0.0, extent)
-        assert 0.0 < scale_bar(axes) < 0.5 * extent
 
 
 def test_an_action_has_its_colour_in_every_figure(session, animal):
@@ -253,6 +242,7 @@ def test_a_plan_asks_for_the_formats_beside_every_report(session, own, tmp_path)
     assert usually == {"figures.pdf"} | {f"{one}.svg" for one in made}
 
 
+@pytest.mark.nightly
 def test_every_name_of_the_transitions_is_on_the_paper():
     words = ["rear_unsupported", "stretch_attend", "turn_right", "rear_supported", "walk", "run"]
     n = len(words)
@@ -419,19 +409,3 @@ def test_a_damaged_comparison_is_a_sentence(study, tmp_path):
     (tmp_path / sets.COMPARISON_FILE).write_text("{", encoding="utf-8")
     with pytest.raises(SessionError, match="compare again"):
         draw_figures(tmp_path)
-
-
-def test_a_refused_test_is_drawn_hollow(study):
-    table = pd.DataFrame(
-        {
-            "session_id": list("abcd"),
-            "subject_id": list("abcd"),
-            "group": ["x", "x", "y", "y"],
-            "speed": [1.0, 2.0, 3.0, 4.0],
-        }
-    )
-    stats = compare(table, ["speed"])
-    with drawing():
-        figure = groups.comparison(table, stats, "speed", "")
-    assert figure is not None
-    assert "no test" in text_of(figure)

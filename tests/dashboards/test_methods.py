@@ -60,27 +60,6 @@ def test_a_model_is_named_with_what_it_learned_from(session: Session) -> None:
     assert ("1.00", "1.50", "pause", "unlabelled", "too fast") in refusal_rows(session)
 
 
-def test_own_labels_make_no_broken_text(session: Session) -> None:
-    named_by(
-        session,
-        "model",
-        actions={"go": "", "still": "", "up": ""},
-        action_model={**CARD, "labels": "people's"},
-    )
-    text = " ".join(methods(session))
-    assert "32 recordings that people labelled" in text
-    assert "The words, without a definition: go, still, up." in text
-    assert ": ;" not in text
-    assert "virtual animals" not in text
-
-
-@pytest.mark.parametrize("source", ["rule", "model", "human"])
-def test_the_sentence_agrees_with_the_source_of_the_bouts(session: Session, source: str) -> None:
-    text = " ".join(methods(named_by(session, source)))
-    assert ("trained recogniser" in text) == (source == "model")
-    assert (f"{len(session.bouts)} bouts were named by a person" in text) == (source == "human")
-
-
 def test_no_vocabulary_is_a_sentence(session: Session) -> None:
     reason = "No actions are named: no vocabulary was made for a snake."
     session.__dict__["bouts"] = session.bouts.iloc[:0]

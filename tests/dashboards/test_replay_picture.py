@@ -19,15 +19,13 @@ import pytest
 from liex_lab.dashboards.replay.layouts import replay_blueprint
 
 from liex_lab.api import correct_session
-from liex_lab.recordings.depth_kernels import rvl_message, to_millimetres
+from liex_lab.recordings.depth_kernels import to_millimetres
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import joint_move
-from liex_lab.sessions.cutouts import Kept
 from liex_lab.sessions.rrd import ReplayWriter
-from liex_lab.sessions.rrd_scene import BACKGROUND as BACKGROUND_ENTITY
-from liex_lab.sessions.rrd_scene import CUTOUTS, IMAGE, PLACES, colour_range, cutout_frame, packed
-from tests.sessions.test_cutouts import BACKGROUND, written
+from liex_lab.sessions.rrd_scene import packed
 from tests.sessions.test_cutouts import MOUSE as KEPT_MOUSE
+from tests.sessions.test_cutouts import written
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 MOUSE = WalkingMouse(steady(2.0), speed_mm_s=220.0)
@@ -183,74 +181,6 @@ def test_the_viewer_complains_of_nothing_where_whole_pictures_are_laid_over_cut_
     alone = looked_at(session)
     for moment in MOMENTS:
         assert (both[moment] != alone[moment]).any()
-
-
-def test_a_replay_of_earlier_versions_is_shown_by_todays_layout_and_its_log_has_the_error(
-    tmp_path: Path,
-) -> None:
-    session = written(tmp_path / "new.liex", "animal", blueprint=replay_blueprint)
-    old = tmp_path / "old.rrd"
-    write_as_before(old, session)
-    log = tmp_path / "log"
-    with viewing([old], log) as client:
-        shown = pictures_of(client)
-    assert any("Failed to detect GOP" in line for line in complaints_in(log))
-    new = looked_at(session)
-    for moment in MOMENTS:
-        before, now = (picture[DEPTH_VIEW][260:] for picture in (shown[moment], new[moment]))
-        changed = np.abs(before.astype(int) - now.astype(int)).max(axis=-1) > 40
-        assert changed.mean() < 0.02, "the skeleton alone is missing"
-
-
-def write_as_before(path: Path, session: Session) -> None:
-    """The depth of a replay as version 0.1.0 logged it: each cut-out as large as its box is."""
-    import rerun as rr
-
-    stream = rr.RecordingStream("liex_lab", recording_id="old", send_properties=False)
-    stream.save(path)
-    stream.send_blueprint(replay_blueprint(session.metadata))
-    camera = KEPT_MOUSE.camera
-    place = KEPT_MOUSE.T_arena_camera
-    stream.log("arena", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log(
-        "arena/camera",
-        rr.Transform3D(translation=place.translation / 1000.0, mat3x3=place.rotation),
-        static=True,
-    )
-    lens = rr.Pinhole(image_from_camera=camera.matrix, resolution=[camera.width, camera.height])
-    stream.log(IMAGE, lens, static=True)
-    boxes = Kept(session).boxes
-    assert boxes is not None
-    look: dict[str, Any] = {"meter": 1000.0, "colormap": "viridis"}
-    look["depth_range"] = colour_range(BACKGROUND, 700.0)
-    scene = rr.EncodedDepthImage(
-        blob=rvl_message(BACKGROUND), media_type="application/rvl", draw_order=-40.0, **look
-    )
-    stream.log(BACKGROUND_ENTITY, scene, static=True)
-    for row, (left, top, right, bottom) in enumerate(boxes[:, 0].tolist()):
-        stream.set_time("frame", sequence=row)
-        stream.set_time("time", duration=row / FPS)
-        matrix = camera.matrix.copy()
-        matrix[:2, 2] -= (left, top)
-        stream.log(
-            f"{CUTOUTS}/1",
-            rr.Pinhole(image_from_camera=matrix, resolution=[right - left, bottom - top]),
-        )
-        stream.log(
-            f"{PLACES}/1",
-            rr.Transform3D(
-                translation=[left, top, 0],
-                child_frame=cutout_frame(0),
-                parent_frame=f"tf#/{IMAGE}",
-            ),
-        )
-        blob = rvl_message(to_millimetres(KEPT_MOUSE.frame(row).depth)[top:bottom, left:right])
-        picture = rr.EncodedDepthImage(
-            blob=blob, media_type="application/rvl", draw_order=-30.0, **look
-        )
-        stream.log(f"{CUTOUTS}/1/depth", picture)
-    stream.flush()
-    stream.disconnect()
 
 
 def test_where_depth_is_cut_out_around_the_animal_it_is_zoomed_and_followed(tmp_path: Path) -> None:

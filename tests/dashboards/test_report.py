@@ -18,14 +18,12 @@ from liex_lab.dashboards.report.report import (
     write_report,
 )
 
-from liex_lab.actions import vocabulary
 from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.activity import around_onsets
 from liex_lab.body import Skeleton
 from liex_lab.exchange import export
 from liex_lab.optics.refraction import Water
 from liex_lab.sessions import Session, SessionWriter
-from liex_lab.sessions.rrd import PALETTE
 from liex_lab.sessions.verdict import Verdict
 from tests.conftest import REPOSITORY
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -93,11 +91,6 @@ def test_the_numbers_of_the_summary_are_on_the_page(session, page):
         assert escape(column) in page, column
 
 
-def test_text_from_the_recording_cannot_become_markup(page):
-    assert "Dark &amp; &lt;cold&gt;." in page
-    assert "<cold>" not in page
-
-
 def test_warnings_come_before_everything_else_and_every_frame_is_accounted_for(session, page):
     assert page.index("Read this first") < page.index('class="cards"')
     assert "did not deliver 6 frames, in 1 gap;" in page
@@ -148,14 +141,6 @@ def test_each_warning_is_a_sentence_of_the_numbers_behind_it(session):
     )
     for sentence, part in zip(warnings(again), parts, strict=True):
         assert part in sentence
-
-
-def test_noise_that_hides_a_pause_is_warned_of(tmp_path, session):
-    noisy = write(tmp_path / "b.liex", WalkingMouse(steady(2.0), sd_mm=8.0))
-    assert [
-        any("not to be trusted" in sentence for sentence in warnings(one))
-        for one in (session, noisy)
-    ] == [False, True]
 
 
 def test_a_measure_around_an_onset_is_what_the_frames_say():
@@ -238,25 +223,6 @@ def test_a_session_without_behaviour_or_without_any_pose_has_a_report_too(tmp_pa
     assert "Over time" in (session.path / "report.html").read_text()
     lost = write(tmp_path / "lost.liex", mouse)
     assert "0.0%" in render(lost)
-
-
-def test_the_replay_and_the_report_give_an_action_the_same_colour(session, page):
-    assert tuple(int(colour[1:], 16) for colour in vocabulary.PALETTE) == PALETTE
-    (ethogram,) = re.findall(r'aria-label="ethogram.*?</svg>', page, flags=re.DOTALL)
-    words = list(session.metadata["actions"])
-    seen = set(session.bouts["action"])
-    assert seen
-    for word, colour in vocabulary.action_colours(words).items():
-        if word in seen:
-            assert colour.lower() in ethogram, word
-
-
-def test_the_page_has_ink_and_paper_of_its_own_in_the_figures(page):
-    """In dark mode a figure's ink is light: no ink of the files is left in the page."""
-    drawn = " ".join(re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL))
-    assert "var(--ink)" in drawn
-    assert "var(--line)" in drawn
-    assert not re.search("#1f2328|#626a73|#d9dbd7|DejaVu", drawn)
 
 
 def test_no_name_on_the_page_is_given_twice(page):

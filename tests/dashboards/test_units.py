@@ -67,13 +67,3 @@ def test_the_table_of_differences_has_the_unit_of_its_measure() -> None:
     assert texts["measure"] == "mean speed, cm/s"
     assert [texts[name] for name in ("estimate", "ci_low", "ci_high")] == ["-4", "-6", "-2"]
     assert texts["effect_size"] == "1"
-
-
-def test_a_bouts_peak_speed_is_in_the_unit_of_the_curve_above_it() -> None:
-    bouts = pd.DataFrame({"action": ["walk"], "start_s": [1.0], "peak_speed_mm_s": [250.0]})
-    table = tables.Table(
-        bouts, {"action": "action", "peak_speed_mm_s": "peak"}, units=tables.BOUT_UNITS
-    )
-    cells = tables.fill(table)["rows"][0]
-    assert cells[1]["text"] == "25"
-    assert tables.BOUTS["peak_speed_mm_s"].endswith("cm/s")

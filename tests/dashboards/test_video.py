@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from liex_lab.dashboards.report.report import write_report
 from liex_lab.dashboards.video import video
-from liex_lab.dashboards.video.film import Film, Relief, View, scale_mm
-from liex_lab.dashboards.video.video import matches
+from liex_lab.dashboards.video.film import Film, Relief, View
 
 from liex_lab.api import export_video
 from liex_lab.errors import PlaceError, SessionError
@@ -59,14 +58,11 @@ def irregular(seed: int) -> np.ndarray:
     "times",
     [
         GAP,
-        np.rint(1000 * np.delete(steady(0.5), [1, 2, 9])) / 1000,  # whole milliseconds
         steady(0.5) + np.append(0.0, np.random.default_rng(1).uniform(-0.008, 0.008, 14)),
-        np.append(steady(0.2), 75.0),
         irregular(2) - irregular(2)[0],
-        np.arange(9) / 119.88,
         np.zeros(1),
     ],
-    ids=["gap", "milliseconds", "jitter", "last frame late", "irregular", "fast", "single frame"],
+    ids=["gap", "jitter", "irregular", "single frame"],
 )
 def test_a_video_has_one_picture_per_row_each_at_its_own_time(tmp_path, times):
     session = write(tmp_path / "circle.liex", WalkingMouse(times))
@@ -103,7 +99,7 @@ def test_heights_are_counted_from_the_floor(session):
     assert np.isnan(heights[0, 0])
 
 
-@pytest.mark.parametrize("share", [1.0, 0.4, 0.03])
+@pytest.mark.parametrize("share", [1.0, 0.03])
 def test_the_bar_of_length_is_a_round_number_of_millimetres_on_the_floor(session, share):
     camera = session.camera
     view = View(0, 0, round(share * camera.width), round(share * camera.height))
@@ -141,18 +137,6 @@ def test_groups_stand_beside_each_other_on_one_scale(tmp_path):
     assert frames[0].shape[1] > single[0].shape[1]
     with pytest.raises(SessionError, match="their groups are control, drug"):
         export_video([tmp_path], tmp_path, groups=["placebo"])
-
-
-def test_the_scale_ends_a_little_above_the_animal_however_long_it_is(session):
-    highest_mm = session.poses["z_mm"].quantile(0.995)
-    assert highest_mm < scale_mm([session]) < 1.1 * highest_mm + 10.0
-
-
-def test_a_kind_of_rear_is_a_rear():
-    assert matches("rear_supported", ["rear"])
-    assert matches("rear", ["rear"])
-    assert not matches("rearrange", ["rear"])
-    assert not matches("walk", ["rear"])
 
 
 def test_the_report_links_to_the_clips_that_were_made(session):

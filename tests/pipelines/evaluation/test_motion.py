@@ -46,16 +46,6 @@ def test_a_straight_animal_bends_nowhere_and_a_bent_one_by_what_it_was_bent() ->
     assert reared["trunk_arch"][0] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_angles_and_lean_do_not_depend_on_where_the_animal_heads() -> None:
-    rng = np.random.default_rng(0)
-    points = np.stack([back(*rng.normal(0.0, 20.0, 4)) for _ in range(50)])
-    a = 2.3
-    turned = points @ np.array([[np.cos(a), np.sin(a), 0], [-np.sin(a), np.cos(a), 0], [0, 0, 1.0]])
-    other = motion.PointMotion(turned + np.array([5.0, -7.0, 0.0])).posture()
-    for name, values in motion.PointMotion(points).posture().items():
-        np.testing.assert_allclose(values, other[name], atol=1e-9)
-
-
 def test_speeds_are_those_that_were_walked_and_stop_at_a_break() -> None:
     n, rate = 120, 60.0
     points = np.repeat(back()[None], n, axis=0)

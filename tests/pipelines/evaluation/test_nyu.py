@@ -63,14 +63,6 @@ def random_hands(n: int) -> np.ndarray:
     )
 
 
-def test_given_the_root_a_shift_of_the_whole_hand_costs_nothing() -> None:
-    truth = random_hands(50)
-    found = nyu.nyu_errors(truth + np.array([3.0, 0.0, 4.0]), truth)
-    assert found["root_estimated_mm_14"] == pytest.approx(5.0)
-    assert found["root_estimated_mm_13"] == pytest.approx(5.0)
-    assert found["root_given_mm_14"] == pytest.approx(0.0, abs=1e-9)
-
-
 def test_the_palm_alone_counts_only_where_it_is_counted() -> None:
     truth = random_hands(30)
     answer = truth.copy()

@@ -5,7 +5,6 @@ the numbers.
 import csv
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,15 +13,12 @@ import cv2
 import numpy as np
 import pytest
 from liex_lab.dashboards.paper import page
-from liex_lab.dashboards.paper.published import DEVIATIONS
 from liex_lab.pipelines.build import plan_of
 from liex_lab.pipelines.evaluation.paper import rows, run
 from liex_lab.pipelines.evaluation.paper.rows import Sweep, chosen_values, with_value
 from liex_lab.pipelines.evaluation.paper.run import PARTS, Budget, keep_results, kept_results
-from liex_lab.pipelines.training.pose_model import recipe_of, training_of
 
 from liex_lab.baselines.baseline import ForestPlan, train_forests
-from liex_lab.baselines.cnn import CnnPlan
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import kept_results_folder
 from liex_lab.errors import LiexError, MissingPackageError, PlanError
@@ -280,38 +276,6 @@ def test_a_row_of_another_version_postures_or_processor_is_named_as_such():
     made |= {"version": package_version("liex_lab"), "test_postures": "drawn"}
     results["sensitivity"] = {}
     assert page.notes_of(results, quick=True) == ["Test postures are drawn."]
-
-
-def test_the_stated_differences_from_the_paper_are_those_of_the_methods():
-    told = " ".join(DEVIATIONS)
-    cnn = CnnPlan()
-    assert f"half its width, hidden layers of {cnn.connected:,} " in told
-    assert cnn.width == 0.5
-    several = {name for name, n in rows.TRAINING_DRAWS.items() if n == 3}
-    assert several == {"paper", "paper-one-pose", "paper-no-metric"}
-    theirs = {"fish": (40, 95_104), "mouse": (40, 104_096), "hand": (20, 72_757)}
-    chosen = {"fish": (7, 40), "mouse": (3, 40), "hand": (3, 20)}
-    for animal, (k, images) in theirs.items():
-        skeleton = Skeleton.load(animal)
-        method, recipe = method_of("paper", skeleton), recipe_of("paper", skeleton)
-        n_examples = method.training_candidates * recipe.n_images
-        assert f"{n_examples:,} ({animal})" in told
-        assert re.search(rf"\b{k * images / n_examples:.0f}\b[\w, ]* times fewer", told)
-        assert f"K is {method.training_candidates} " in told
-        assert f"{method_of('default', skeleton).training_candidates} (" in told
-        for one in (recipe, recipe_of("default", skeleton)):
-            for amount in (one.n_images, one.n_correction, one.n_calibration):
-                assert f"{amount:,}" in told or not amount
-        assert f"m: {method.regressors.n_tests};" in told
-        for plan in (method.regressors, method.metric):
-            assert (plan.max_leaf, plan.min_leaf) == (5, 1)
-        assert (method.rounds, method.n_candidates) == chosen[animal]
-        ours = recipe_of("default", skeleton)
-        assert recipe.degraded_share == ours.degraded_share
-        assert recipe.n_images >= 0.8 * ours.n_images
-        for variant in ("rf", "cnn"):
-            theirs = training_of(variant, skeleton).recipe
-            assert replace(theirs, n_calibration=0) == replace(recipe, n_calibration=0)
 
 
 def test_a_sweep_changes_one_number_of_a_method_and_nothing_else():

@@ -20,11 +20,6 @@ def test_workers_gain_until_the_scheduler_is_the_limit() -> None:
     assert found["1000"] <= 3600 / 0.5
 
 
-def test_without_cost_of_handing_out_many_workers_are_as_good_as_they_are_many() -> None:
-    found = simulate([60.0], scheduler_s=0.0, workers=(1, 1000))
-    assert found["1000"] == pytest.approx(1000 * found["1"], rel=0.01)
-
-
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return write(tmp_path_factory.mktemp("short") / "circle.liex", MOUSE)

@@ -134,19 +134,3 @@ def test_the_bundled_models_know_their_words_and_are_small(
     assert told[300.0] == {}
     if animal == "fish":
         assert "0.02 s, 0.6 frames at 30 per second" in told[30.0]["c_turn"]
-
-
-@pytest.mark.nightly
-def test_an_hour_is_recognised_in_seconds() -> None:
-    """Ten seconds are promised on two cores; a busy machine has six times as long for a sixth of
-    it.
-    """
-    import time
-
-    from tests.actions.toy import going_and_staying
-
-    one, model = going_and_staying(1, rate_hz=30.0, seconds=600.0), load_action_model("mouse")
-    model.recognise(going_and_staying(2).track)  # compiles
-    begin = time.process_time()
-    model.recognise(one.track)
-    assert time.process_time() - begin < 10.0

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from liex_lab.dashboards.paper.figures import draw_confusions
-from liex_lab.pipelines.evaluation.actions import one_hour, track_error_mm
+from liex_lab.pipelines.evaluation.actions import track_error_mm
 from liex_lab.pipelines.training import action_model as module
 from liex_lab.pipelines.training.action_model import AgentTrack, Scenario, acted, thinned
 
-from liex_lab.actions.storage import load_action_model
 from liex_lab.estimation.estimator import PoseEstimator
 
 CUT = Scenario("fish", 91, 5, 50.0, word="c_turn")
@@ -67,13 +66,6 @@ def test_a_slower_camera_sees_the_frames_nearest_to_its_times() -> None:
     wanted = np.arange(0.0, times[-1] * 1e-9, 1.0 / 30.0)
     by_hand = sorted({min(range(60), key=lambda k: (abs(times[k] * 1e-9 - t), k)) for t in wanted})
     np.testing.assert_array_equal(rows, by_hand)
-
-
-def test_an_hour_is_an_hour_of_frames(recording: AgentTrack) -> None:
-    told = one_hour(load_action_model("mouse"), recording.tracked(), hour_s=60.0)
-    usual = np.median(np.diff(recording.observations.times_ns)) * 1e-9
-    assert told["frames"] == round(60.0 / usual)
-    assert told["seconds"] > 0.0
 
 
 def test_the_confusions_are_drawn_as_a_picture(tmp_path: Path) -> None:
