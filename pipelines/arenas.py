@@ -33,7 +33,6 @@ from .compiling import compile_ahead
 from .session import HEAVY, MEASURING, Prepared, check_unused, prepare, read_ahead
 
 _FACTS = ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age")
-_REMEMBERED_BYTES = 256 * 2**20  # memory for frames that the arenas share to learn their scenes
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,8 @@ def run_arenas(
         if problem := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {problem}")
         compile_ahead(first.animal.skeleton, progress)
-        shared = opened.remembering(_REMEMBERED_BYTES)
+        # memory for frames that the arenas share to learn their scenes
+        shared = opened.remembering(256 * 2**20)
         arenas = arenas_of(shared, first)
         corners = {one.name: stated_corners(shared, first, one.region) for one in arenas}
         within = masks_apart(corners, opened.width, opened.height)
@@ -114,8 +114,7 @@ def run_arenas(
             own = plan.with_settings(stated) if plan else Plan.load(USUAL).with_settings(chosen)
             try:
                 seen = shared.masked(corners[one.name], lent=True)
-                unnamed = None if plan else chosen
-                fitted = fit_plan(seen, own, settings=unnamed, progress=progress)
+                fitted = fit_plan(seen, own, settings=(None if plan else chosen), progress=progress)
                 prepared = prepare(fitted, folder, started, progress)
                 if pool is not None and isinstance(recording, str | Path):
                     prepared.measure_by(pool, recording, progress)

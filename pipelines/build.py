@@ -41,10 +41,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-# least and largest length of a user's own animal, over the home length
-_SPANS = (0.6, 1.8)
-
-
 def animal_of(plan: Plan) -> sections.AnimalSettings:
     """The plan's animal, completed from the skeleton if that is the user's own.
 
@@ -57,7 +53,8 @@ def animal_of(plan: Plan) -> sections.AnimalSettings:
     if not animal.skeleton.endswith(".toml"):
         return animal
     skeleton = Skeleton.load(animal.skeleton)
-    low, high = (round(factor * skeleton.length, 3) for factor in _SPANS)
+    # least and largest length of a user's own animal, over the home length
+    low, high = (round(factor * skeleton.length, 3) for factor in (0.6, 1.8))
     own = {"name": skeleton.name, "spine_min_mm": low, "spine_max_mm": high}
     usual = type(animal).model_fields  # a plan that was written to a file states its defaults
     return animal.model_copy(
@@ -285,8 +282,7 @@ def propose_arenas(recording: Recording, plan: Plan) -> list[sections.SeveralAre
     Returns:
         Two to eight of them, with disjoint polygons; [] if only one is found.
     """
-    view = Skeleton.load(plan.animal.skeleton).view
-    if view.frame != VIEWS[0] or recording.region_px:
+    if Skeleton.load(plan.animal.skeleton).view.frame != VIEWS[0] or recording.region_px:
         return []
     scene, stride = _sampled(recording, plan)
     return [
@@ -298,9 +294,6 @@ def propose_arenas(recording: Recording, plan: Plan) -> list[sections.SeveralAre
         )
         for k, corners in enumerate(support_plane.arenas_apart(scene), 1)
     ]
-
-
-_RULED = "mouse"  # the animal that the rules were made for
 
 
 def build_recording(
@@ -583,7 +576,8 @@ def why_nameless(plan: Plan, skeleton: Skeleton) -> str:
 
     The rules are a mouse's: a hand does not rear, and a snake does not run.
     """
-    if plan.actions.model is not None or skeleton.name == _RULED:
+    # the animal that the rules were made for
+    if plan.actions.model is not None or skeleton.name == "mouse":
         return ""
     return (
         f"No actions are named: no vocabulary was made for a {skeleton.name}. `liex train actions` "

@@ -23,11 +23,8 @@ from liex_lab.tracking.tracker import FrameTracker
 from .build import animal_of, build_tracker
 
 USUAL = "mouse"  # tried first if no plan is named
-_HANDFUL = "foreground.n_background_frames=24"
 # of the unmirrored images' predicted error: below it the mirror image fits a hand better
 _MIRRORED_BELOW = 0.75
-# share of what rises above the floor that the body has to cover, if nothing moves, to be an animal
-_SOME_COVERED = 0.25
 
 
 @dataclass(frozen=True)
@@ -200,14 +197,15 @@ def _shows_an_animal(tracker: FrameTracker) -> bool:
         or fit is None
     ):
         return True
-    return scene.support_plane.moves or fit.covered >= _SOME_COVERED
+    # if nothing moves, the body has to cover some of what rises above the floor
+    return scene.support_plane.moves or fit.covered >= 0.25
 
 
 def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:
     """Fit a plan, or the bundled plan of that name, to a few frames."""
     name = plan if isinstance(plan, str) else animal_of(plan).name
     chosen = Plan.load(plan) if isinstance(plan, str) else plan
-    plan = chosen.with_settings([_HANDFUL])
+    plan = chosen.with_settings(["foreground.n_background_frames=24"])
     try:
         fit = build_tracker(recording, plan).sample_fit
     except LiexError as error:

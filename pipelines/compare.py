@@ -39,7 +39,6 @@ from .study.status import misnamed
 
 # copies of a session that were, or are about to be, replaced
 _SET_ASIDE = re.compile(r"\.(?:outdated(?:-\d+)?|old|part)[/\\]")
-_OBSERVED_SHARES = 8  # since this schema version shares are of the observed frames
 
 
 def compare_groups(
@@ -172,7 +171,8 @@ def _write_tables(
 
 def _counted_otherwise(sessions: Mapping[str, Session]) -> list[str]:
     """A sentence on sessions of an earlier schema, with other shares; [] if none or all are."""
-    old = [k for k, one in sessions.items() if one.metadata["schema_version"] < _OBSERVED_SHARES]
+    # since this schema version shares are of the observed frames
+    old = [k for k, one in sessions.items() if one.metadata["schema_version"] < 8]
     if len(old) in (0, len(sessions)):
         return []
     return [

@@ -25,8 +25,6 @@ from liex_lab.runtime.processes import n_cores, own_python
 from liex_lab.runtime.progress import COMPILING, Progress, silent
 
 KERNELS = Path(__file__).with_name("kernels.json")
-_FEWEST_CORES = 2
-_DIGITS = 16
 
 
 def compile_ahead(animal: str, progress: Progress = silent) -> bool:
@@ -39,12 +37,7 @@ def compile_ahead(animal: str, progress: Progress = silent) -> bool:
     import numba
 
     rows = listed_kernels(animal)
-    if (
-        not rows
-        or n_cores() < _FEWEST_CORES
-        or numba.config.DISABLE_JIT
-        or numba.config.BOUNDSCHECK
-    ):
+    if not rows or n_cores() < 2 or numba.config.DISABLE_JIT or numba.config.BOUNDSCHECK:
         return False
     done = _mark(animal, rows)
     if done is None or done.is_file():
@@ -175,7 +168,7 @@ def _mark(animal: str, rows: Sequence[Mapping[str, Any]]) -> Path | None:
     for path in (KERNELS, *sorted(MODELS.parent.rglob("*.py"))):
         stat = path.stat()
         mark.update(f"{path} {stat.st_mtime_ns} {stat.st_size}\n".encode())
-    return Path(folder) / f"compiled-{mark.hexdigest()[:_DIGITS]}"
+    return Path(folder) / f"compiled-{mark.hexdigest()[:16]}"
 
 
 def main() -> None:

@@ -39,7 +39,6 @@ from liex_lab.tracking.tracker import FrameTracker
 from .build import build_recording, build_tracker, open_planned, stated_corners
 
 _STEPS_MM = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)
-_N_PROBED = 8
 # a folder must not have the suffix of another kind of file
 _OTHER_KINDS = re.compile(
     r"\.(bag|db3|oni|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$",
@@ -160,7 +159,7 @@ def _is_mcap(target: Path) -> bool:
 
 def largest_step(recording: Recording) -> float | None:
     """The largest step, mm, that divides all depths of a few frames; None if absent."""
-    rows = np.unique(np.linspace(0, len(recording) - 1, _N_PROBED).round().astype(int))
+    rows = np.unique(np.linspace(0, len(recording) - 1, 8).round().astype(int))
     depths = [recording.frame(int(row)).depth for row in rows]
     for step in _STEPS_MM:
         if all(whole_steps(depth, step) is not None for depth in depths):

@@ -41,9 +41,7 @@ from .session import measure_behaviour
 
 Numbers = NDArray[np.int64]  # of rows
 
-_BUSY = ".correcting"
 _AS_BEFORE = ("kinematics", "zones")  # tables that bout edits do not change
-_HELD = 20.0  # weight of a manually placed joint relative to one that may follow
 
 
 def correct_session(
@@ -76,7 +74,9 @@ def correct_session(
         SessionError: a correction cannot be applied, or another program is correcting the session.
     """
     raw = Session.open(session, raw=True)
-    with durable.locked(raw.path / _BUSY, f"{raw.path} is being corrected by another program"):
+    with durable.locked(
+        raw.path / ".correcting", f"{raw.path} is being corrected by another program"
+    ):
         folder = durable.unlinked_tree(raw.path / corrections.FOLDER)
         aside = durable.unlinked(raw.path / f"{corrections.FOLDER}.old")
         durable.put_back(folder, aside)  # a process may have been killed here
@@ -383,7 +383,8 @@ def place_joints(
         k = int(np.searchsorted(rows, np.searchsorted(index, move.frame)))
         j = names.index(move.joint)
         points[k, j] = (move.x_mm, move.y_mm, move.z_mm)
-        weight[k, j] = _HELD
+        # weight of a manually placed joint relative to one that may follow
+        weight[k, j] = 20.0
     if not np.isfinite(points).all():
         raise SessionError(
             "a joint was moved in a frame that has no pose; take that correction back"

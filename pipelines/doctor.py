@@ -66,8 +66,6 @@ from .build import (
 from .choice import USUAL, Proposal, propose_plan
 
 _USUAL_HZ = 30.0
-_USUAL_FOCAL = 0.9  # of the image's width: depth cameras have a field of view of 55 to 65 degrees
-_GUESS = ["camera.fx=1.0", "camera.fy=1.0", "camera.cx=0.0", "camera.cy=0.0"]
 
 
 def open_anyhow(
@@ -97,7 +95,9 @@ def open_anyhow(
             if unknown_camera:
                 raise
             unknown_camera = True
-            guessed = guessed.with_settings(_GUESS)
+            guessed = guessed.with_settings(
+                ["camera.fx=1.0", "camera.fy=1.0", "camera.cx=0.0", "camera.cy=0.0"]
+            )
         except UnknownTimesError:
             missing.append(
                 f"the images have no timestamps, and {_USUAL_HZ:g} frames/s were assumed "
@@ -125,7 +125,8 @@ def _guess_camera(recording: Recording) -> str:
     width = recording.width
     height = recording.height
     names = camera.of_size(width, height)
-    focal = camera.preset(names[0], width, height).fx if names else round(_USUAL_FOCAL * width, 1)
+    # of the image's width: depth cameras have a field of view of 55 to 65 degrees
+    focal = camera.preset(names[0], width, height).fx if names else round(0.9 * width, 1)
     like = f"those of a {names[0]}" if names else "those of many a depth camera"
     cx = (width - 1) / 2
     cy = (height - 1) / 2
@@ -178,7 +179,6 @@ _TEXT = read_toml(Path(__file__).with_name("doctor.toml"))
 FINDINGS: Final[dict[str, str]] = _TEXT["findings"]  # key of the JSON: its meaning
 # sampled frames, spread over the recording; as many as a run learns its scene from
 _N_SAMPLED = 96
-_N_RAW = 16
 # frames compared with their predecessors, and the length of a window in a longer recording
 _N_COMPARED = 400
 _WINDOW = 8
@@ -226,7 +226,7 @@ def examine(
             plan = plan.with_settings(["arena.region="])
         stride = stride_for(ideal, animal_of(plan).spine_min_mm)
         sample = sample_frames(ideal, _N_SAMPLED, stride)
-        raw = sample if ideal is opened else sample_frames(opened, _N_RAW)
+        raw = sample if ideal is opened else sample_frames(opened, 16)
         facts, unlikely, median_mm = _depth_facts(raw)
         scene: list[str] = []
         arenas: list[sections.SeveralArenas] = []
@@ -425,10 +425,7 @@ def _finite(value: float) -> float | None:
 # The scene: floor, noise, arena, water and animal in the sampled frames.
 
 
-_LEVEL_RAD = math.radians(3.0)  # largest angle between a tank's floor and its water surface
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
-_MUCH_NOISE = 0.5  # of the height from which a pixel counts as the animal
-_STILL_SHARE = 0.4  # of the animal's area was in the background
 # sizes outside the plan's range are searched down to and up to this factor
 _WIDER = 20.0
 
@@ -570,7 +567,8 @@ def _floor_facts(
             "check the camera's range, sunlight, and surfaces that shine or swallow infrared light"
         )
     least = plan.foreground.min_height_mm
-    if noise is not None and noise > _MUCH_NOISE * least:
+    # of the height from which a pixel counts as the animal
+    if noise is not None and noise > 0.5 * least:
         problems.append(
             f"the floor's depth varies by {noise:.1f} mm from frame to frame, and a pixel counts "
             f"as the animal from {least:g} mm above it; bring the camera nearer, keep sunlight "
@@ -593,7 +591,8 @@ def _water_depth(
             "water"
         ]
     angle = math.acos(min(1.0, cosine))
-    if angle <= _LEVEL_RAD:
+    # largest angle between a tank's floor and its water surface
+    if angle <= math.radians(3.0):
         return deep, []
     tilts = np.arctan2(-floor.normal[:2], floor.normal[2])
     return deep, [
@@ -616,7 +615,8 @@ def _size_facts(
     area = float(
         (scene.background[covered].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy)
     )
-    still = area > _STILL_SHARE * scene.area_mm2
+    # of the animal's area was in the background
+    still = area > 0.4 * scene.area_mm2
     problems = []
     if still:
         problems.append(

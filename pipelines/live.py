@@ -26,10 +26,7 @@ from liex_lab.tracking.tracker import FrameTracker
 
 from .build import build_recording, build_tracker
 
-# first frames, from which the background, the floor and the animal's size are learned
-LEARN_FRAMES = 90
 _AT_ONCE = 16
-_LONG_S = 0.2
 Viewer = Callable[[FrameTracker, streaming.Arriving], Any]
 
 
@@ -104,7 +101,7 @@ def track_live(
     arriving: streaming.Arriving,
     plan: Plan,
     *,
-    learn_frames: int = LEARN_FRAMES,
+    learn_frames: int = 90,  # to learn the background, the floor and the animal's size from
     viewer: Viewer | None = None,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], track.Tracked]:
@@ -192,7 +189,7 @@ def _together(arrivals: Iterator[streaming.Arrival]) -> Iterator[list[streaming.
     some: list[streaming.Arrival] = []
     for arrival in arrivals:
         some.append(arrival)
-        if len(some) == _AT_ONCE or time.perf_counter() - arrival.at_s < _LONG_S:
+        if len(some) == _AT_ONCE or time.perf_counter() - arrival.at_s < 0.2:
             yield some
             some = []
     if some:

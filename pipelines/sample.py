@@ -20,10 +20,6 @@ SPINE_MM = 65.0
 N_FRAMES = 154
 # frames dropped as by a camera, so that the sample has gaps like real recordings
 LEFT_OUT = (40, 101, 102, 103)
-_START_NS = 10**9  # the clock of a camera switched on a second ago: no date is implied
-# slow but strong compression: packed once, downloaded often
-_CHUNK_BYTES = 1 << 20
-_LEVEL = 19
 
 
 def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
@@ -47,12 +43,14 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
         floor_distance_mm=mouse.floor.distance_mm,
         input_sha256="",
     )
-    writer = mcap.McapWriter(path, origin, level=_LEVEL, chunk_size=_CHUNK_BYTES)
+    # slow but strong compression: packed once, downloaded often
+    writer = mcap.McapWriter(path, origin, level=19, chunk_size=1 << 20)
     try:
         for frames in mouse.chunks(16):
             kept = [frame for frame in frames if frame.index not in LEFT_OUT]
             depth = [frame.depth.astype(np.uint16) for frame in kept]
-            writer.add([frame.time_ns + _START_NS for frame in kept], depth)
+            # the clock of a camera switched on a second ago: no date is implied
+            writer.add([frame.time_ns + 10**9 for frame in kept], depth)
             progress(frames[-1].index + 1, N_FRAMES, "writing the sample")
     finally:
         writer.abandon()

@@ -25,9 +25,6 @@ from liex_lab.tracking.track import Track
 Array = NDArray[np.float64]
 
 _FLIP_S = 0.15  # to either side: a body that briefly points the other way is an error
-_WALL_BL = 0.6  # decay length of a wall's influence, in body lengths
-_DOUBT = 1.5  # makes the logarithm of the median error of order one
-_AXIS = {1: 0.75, -1: 0.4}  # the trunk's share of the chain, for a base at the rear or front
 _GROUPS = 3  # parts of the chain whose bends are summed
 _PIECE = 4096  # ticks per block
 
@@ -123,7 +120,8 @@ def _stands(skeleton: Skeleton) -> bool:
 def _forward(skeleton: Skeleton) -> tuple[int, int]:
     """The joints (from, to) that define the forward direction of the trunk."""
     way = 1 if skeleton.offsets[1:, 0].sum() > 0 else -1
-    end = max(1, round(_AXIS[way] * (skeleton.n_joints - 1)))
+    # the trunk's share of the chain, for a base at the rear or front
+    end = max(1, round({1: 0.75, -1: 0.4}[way] * (skeleton.n_joints - 1)))
     return (0, end) if way > 0 else (end, 0)
 
 
@@ -208,14 +206,12 @@ class _OnClock:
         track = self._track
         rows = self._rows[first:stop] if starts is None else self._rows[starts[0] : starts[-1]]
         n = len(rows)
-        distance = np.nan_to_num(self._wall[rows], nan=1e6)
-        error = np.nan_to_num(track.predicted_error_mm[rows], nan=0.0)
         columns = np.concatenate(
             [
                 track.joints_mm[rows].reshape(n, -1),
                 track.angles_rad[rows].reshape(n, -1),
-                distance[:, None],
-                error[:, None],
+                np.nan_to_num(self._wall[rows], nan=1e6)[:, None],
+                np.nan_to_num(track.predicted_error_mm[rows], nan=0.0)[:, None],
             ],
             axis=1,
         )
@@ -284,8 +280,7 @@ def _channels(
     (rear, front), (length_mm, usual_mm) = _forward(skeleton), units_mm
     axis = joints[:, front] - joints[:, rear]
     climb = np.arctan2(axis[:, 2], np.hypot(axis[:, 0], axis[:, 1]))
-    middle = joints.mean(axis=1) / length_mm
-    velocity = _rate(_softened(middle), step)
+    velocity = _rate(_softened(joints.mean(axis=1) / length_mm), step)
     ahead = np.cos(heading)
     aside = np.sin(heading)
     forward = velocity[:, 0] * ahead + velocity[:, 1] * aside
@@ -318,8 +313,10 @@ def _channels(
         z = joints[..., 2] / length_mm
         columns += [z[:, -1], z.mean(axis=1), z[:, 0], z[:, -1] - z[:, 0]]
     columns += [
-        np.exp(-np.maximum(wall, 0.0) / (_WALL_BL * length_mm)),
-        np.log1p(_DOUBT * error / usual_mm),
+        # a wall's influence decays over 0.6 body lengths
+        np.exp(-np.maximum(wall, 0.0) / (0.6 * length_mm)),
+        # 1.5 makes the logarithm of the median error of order one
+        np.log1p(1.5 * error / usual_mm),
     ]
     return np.concatenate([c[:, None] if c.ndim == 1 else c for c in columns], axis=1)
 
@@ -338,11 +335,6 @@ def _rate(rows: Array, step: float) -> Array:
 
 
 # Window features of every tick: mean, spread and extreme of the channels over windows in seconds.
-
-
-HALF_WINDOWS_S = (0.06, 0.2, 0.6)
-SIDE_WINDOWS_S = ((-0.9, -0.35), (-0.35, -0.08), (0.08, 0.35), (0.35, 0.9))
-RANGE_S = 0.25
 
 
 def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float32]:
@@ -364,15 +356,15 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
     start_at = np.zeros((1, x.shape[1]))
     sums, squares = (np.concatenate([start_at, np.cumsum(v, axis=0)]) for v in (x, x * x))
     parts: list[NDArray[Any]] = [x, np.abs(x[:, signed])]
-    for half in HALF_WINDOWS_S:
+    for half in (0.06, 0.2, 0.6):
         mean, square = (_window_mean(total, -half, half, step) for total in (sums, squares))
         spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
         parts += [mean.astype(np.float32), np.abs(mean[:, signed]), spread.astype(np.float32)]
-    for start, stop in SIDE_WINDOWS_S:
+    for start, stop in ((-0.9, -0.35), (-0.35, -0.08), (0.08, 0.35), (0.35, 0.9)):
         mean, square = (_window_mean(total, start, stop, step) for total in (sums, squares))
         level = np.where(signed, np.abs(mean), mean)
         parts += [level.astype(np.float32), np.sqrt(np.maximum(square, 0.0)).astype(np.float32)]
-    parts.append(_extreme(np.abs(x), RANGE_S, step))
+    parts.append(_extreme(np.abs(x), 0.25, step))
     return np.concatenate(parts, axis=1, dtype=np.float32)
 
 

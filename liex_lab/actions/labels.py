@@ -31,7 +31,6 @@ Array = NDArray[np.float64]
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")
 _NORMAL = 1.959964  # of a 95 % interval
-_THOUSANDS = re.compile(r"[1-9]\d{0,2},\d{3}")  # next to 950, 1,034 is not a decimal number
 
 
 def read_labels(path: str | Path) -> pd.DataFrame:
@@ -97,7 +96,10 @@ def _numbers(column: pd.Series) -> NDArray[np.float64]:
     """A column (n,) of seconds or times as hh:mm:ss as numbers; NaN if not a number."""
     texts = [str(cell) for cell in column]
     commas = [text for text in texts if "," in text]
-    thousands = len(commas) < len(texts) and all(map(_THOUSANDS.fullmatch, commas))
+    # next to 950, 1,034 is not a decimal number
+    thousands = len(commas) < len(texts) and all(
+        map(re.compile(r"[1-9]\d{0,2},\d{3}").fullmatch, commas)
+    )
     return np.array([np.nan if thousands and "," in text else _seconds(text) for text in texts])
 
 

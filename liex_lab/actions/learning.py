@@ -32,18 +32,11 @@ Array = NDArray[np.float64]
 _HIDDEN = 64
 _EPOCHS = 10
 _BATCH = 512
-_MEMBERS = 2
 # for few labels
 _LEAST_STEPS = 1500
 _MOST_EPOCHS = 200
-_WEIGHT_DECAY = 2e-3
-_RATE = 1.5e-3
-_LEAST_RATE = 1e-5
-_MOST_TICKS = 120_000  # to train on; more are subsampled
-_SHARPNESS = 0.1
 # quantiles of the speeds of a word, and of its bouts' peak speeds
 _USUAL = (0.005, 0.99)
-_LEAST_PEAK = 0.01
 _FAST = 1.0  # lengths per second, mean of a bout of a fast action
 _NEVER = -30.0  # the logit of a word without training data
 
@@ -78,7 +71,7 @@ def learn(
     progress(0, 3, "features of the labelled recordings")
     examples = gather([*tracks, *sequences], words, clock_hz)
     progress(1, 3, "training the networks")
-    networks = tuple(train_network(examples, len(words), seed + k) for k in range(_MEMBERS))
+    networks = tuple(train_network(examples, len(words), seed + k) for k in range(2))
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
     speeds, peaks = speeds_of(examples, len(words))
     chain = SemiMarkovModel.learn(examples.runs[: len(tracks)], len(words))
@@ -89,7 +82,7 @@ def learn(
         share,
         networks,
         chain,
-        _SHARPNESS,
+        0.1,
         speeds,
         peaks,
         definitions or {},
@@ -136,7 +129,7 @@ def speeds_of(examples: Examples, n_words: int) -> tuple[Array, Array]:
         if own.any():
             limits[k] = np.quantile(examples.speed[examples.code == k], _USUAL)
             if np.median(mean[own]) > _FAST:
-                least[k] = np.quantile(peak[own], _LEAST_PEAK)
+                least[k] = np.quantile(peak[own], 0.01)
     return limits, least
 
 
@@ -153,7 +146,8 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     Returns:
         The network, float32, with the standardisation of its features.
     """
-    step = max(1, -(-len(examples.code) // _MOST_TICKS))
+    # to train on; more are subsampled
+    step = max(1, -(-len(examples.code) // 120_000))
     rows = np.arange(seed % step, len(examples.code), step)
     features = examples.features[rows]
     code = examples.code[rows]
@@ -169,9 +163,9 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
         (_HIDDEN,),
         epochs=epochs,
         batch=batch,
-        rate=_RATE,
-        least_rate=_LEAST_RATE,
-        weight_decay=_WEIGHT_DECAY,
+        rate=1.5e-3,
+        least_rate=1e-5,
+        weight_decay=2e-3,
         seed=seed,
     )
     if len(present) == 2:  # one logit decides between two words

@@ -21,7 +21,6 @@ from liex_lab.tracking.track import Track
 Array = NDArray[np.float64]
 
 N_FRAMES = 32
-_PYRAMID = (4, 2, 1)  # equal parts, each described by its mean and standard deviation
 
 
 def tangent_descriptor(track: Track) -> Array:
@@ -83,7 +82,8 @@ def pyramid(rows: Array) -> Array:
     Returns:
         (14 k,) for each of the 7 parts, k means and k standard deviations.
     """
-    parts = [part for n in _PYRAMID for part in np.split(rows, n)]
+    # equal parts, each described by its mean and standard deviation
+    parts = [part for n in (4, 2, 1) for part in np.split(rows, n)]
     return np.concatenate([np.concatenate([part.mean(axis=0), part.std(axis=0)]) for part in parts])
 
 
@@ -116,8 +116,6 @@ DESCRIPTORS: dict[str, Callable[[Track], Array]] = {
     "tangent": tangent_descriptor,
     "joints": position_descriptor,
 }
-_TREES = 50
-_DEPTH = 20
 
 
 @dataclass(frozen=True)
@@ -144,7 +142,7 @@ class SequenceForest:
         """
         from sklearn.ensemble import RandomForestClassifier
 
-        forest = RandomForestClassifier(_TREES, max_depth=_DEPTH, random_state=seed)
+        forest = RandomForestClassifier(50, max_depth=20, random_state=seed)
         return SequenceForest(descriptor, forest.fit(rows, list(words)))
 
     def name(self, rows: Array) -> list[str]:

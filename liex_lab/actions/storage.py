@@ -19,9 +19,7 @@ from liex_lab.errors import ModelError
 from liex_lab.mlp import Network, check_layers
 from liex_lab.runtime.durable import replacing
 
-_DEEPEST = 20
 _MOST_BYTES = 1 << 28
-_THE_DAY = (1980, 1, 1, 0, 0, 0)  # the earliest date of a zip entry
 _ADDRESS = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
@@ -52,7 +50,10 @@ def write_plain(document: Any, path: str | Path) -> None:
             *((name, contents[name]) for name in names),
             ("schema.json", schema.encode()),
         ]:
-            packed.writestr(zipfile.ZipInfo(name, _THE_DAY), content, zipfile.ZIP_DEFLATED)
+            # the earliest date of a zip entry
+            packed.writestr(
+                zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content, zipfile.ZIP_DEFLATED
+            )
 
 
 def read_plain(path: str | Path) -> Any:
@@ -70,7 +71,7 @@ def read_plain(path: str | Path) -> Any:
 
 def _value(node: Any, packed: zipfile.ZipFile, depth: int) -> Any:
     """The value of a schema's node; raises ValueError if it is not plain data."""
-    if depth > _DEEPEST:
+    if depth > 20:
         raise ValueError("its tables are nested too deeply")
     kind = node["__loader__"]
     content = node.get("content")

@@ -35,7 +35,6 @@ from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
 
-_SHORT = 0.08  # quantile of an action's lengths that counts as the shortest
 _DECODED_PIECE = 8192  # ticks per block of probabilities ...
 _MARGIN = 512  # ... and its margin on either side
 
@@ -76,7 +75,8 @@ class SemiMarkovModel:
             for (before, _), (after, _) in pairwise(run):
                 counts[before, after] += 1.0
         np.fill_diagonal(counts, 0.0)
-        shortest = np.array([np.quantile(some, _SHORT) if some else 0.1 for some in lengths])
+        # quantile of an action's lengths that counts as the shortest
+        shortest = np.array([np.quantile(some, 0.08) if some else 0.1 for some in lengths])
         mean = np.array([np.mean(some) if some else 0.5 for some in lengths])
         return SemiMarkovModel(
             shortest, np.maximum(mean, shortest), counts / counts.sum(axis=1, keepdims=True)
@@ -171,17 +171,10 @@ CLOCKS_HZ = {"fish": 50.0}
 CLOCK_HZ = 30.0
 # ticks per block of features
 _PIECE = 16_384
-_MARGIN_S = 1.5
 # half window of the speed; tolerances of its limits; penalty beyond them, nats
-_SPEED_S = 0.2
 _SLACK = 1.25
 _STILL = 0.1
 _UNSEEN = 6.0
-# number of decodings with refused bouts, and the penalty of a refused tick
-_MOST_DECODED = 6
-_REFUSED = 10.0
-_FRAMES_NEEDED = 3.5  # within a detectable bout: fewer than four frames are not enough
-_RATE_SLACK_HZ = 1.0  # deviation of a camera from its nominal rate
 
 
 @dataclass(frozen=True)
@@ -230,7 +223,7 @@ class TimelineModel:
         Yields:
             A slice of consecutive ticks, and their log probabilities (ticks, K).
         """
-        margin = round(_MARGIN_S * self.clock_hz)
+        margin = round(1.5 * self.clock_hz)
         m = len(segment.times_s)
         for ticks in blocks(m, _PIECE):
             low = max(0, ticks.start - margin)
@@ -369,7 +362,7 @@ class TimelineModel:
         after each tick.
         """
         nothing = self.words.index(UNLABELLED)
-        for left in reversed(range(_MOST_DECODED)):
+        for left in reversed(range(6)):
             decoded = self.chain.decode(scores, 1.0 / self.clock_hz, allocate)
             starts, stops, words = runs_of(decoded)
             slow = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
@@ -391,7 +384,7 @@ class TimelineModel:
             if not wrong.any():
                 break
             for start, stop, word in zip(starts[wrong], stops[wrong], words[wrong], strict=True):
-                scores[start:stop, word] -= _REFUSED
+                scores[start:stop, word] -= 10.0
         return decoded
 
     def unresolved(self, times_ns: NDArray[np.int64]) -> dict[str, str]:
@@ -413,13 +406,15 @@ class TimelineModel:
         found = {}
         for word, shortest in zip(self.words, self.chain.shortest_s, strict=True):
             reasons = []
-            if word != UNLABELLED and shortest * rate < _FRAMES_NEEDED:
+            # within a detectable bout: fewer than four frames are not enough
+            if word != UNLABELLED and shortest * rate < 3.5:
                 reasons.append(
                     f"its shortest bouts last {shortest:.2f} s, {shortest * rate:.1f} frames at "
                     f"{rate:.0f} per second, and may be missed"
                 )
             part = fastest.get(word)
-            if part is not None and rate < part.least_hz - _RATE_SLACK_HZ:
+            # deviation of a camera from its nominal rate
+            if part is not None and rate < part.least_hz - 1.0:
                 reasons.append(
                     f"{part.what} takes about {part.seconds:.2f} s, {part.seconds * rate:.1f} "
                     f"frames at {rate:.0f} per second: the action is found, but how fast, how "
@@ -500,8 +495,7 @@ def steady_speed(segment: Segment, names: Sequence[str]) -> Array:
     """
     from scipy.ndimage import uniform_filter1d
 
-    step = segment.times_s[1] - segment.times_s[0]
-    width = 2 * max(1, round(_SPEED_S / step)) + 1
+    width = 2 * max(1, round(0.2 / (segment.times_s[1] - segment.times_s[0]))) + 1
     return np.asarray(
         uniform_filter1d(segment.values[:, names.index("speed")], width, mode="nearest")
     )

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 # relative tolerance of a number given with "about"; a bout's ends are less certain
 ABOUT = 0.25
-ABOUT_TIME = 1.0 / 3.0
 
 
 class Measure(NamedTuple):
@@ -219,7 +218,7 @@ WORDS: dict[str, dict[str, Definition]] = {
         "dart": _defined(
             "a burst from standing to {0} cm/s or more and back within about {1} s",
             Limit("peak_speed_mm_s", least=230.0),
-            Limit("duration_s", most=1.0, about=ABOUT_TIME),
+            Limit("duration_s", most=1.0, about=1.0 / 3.0),
         ),
         "stretch_attend": _defined(
             "body long, low and straight, below {0} cm/s", Limit("speed_mm_s", most=50.0)

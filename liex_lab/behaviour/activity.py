@@ -503,11 +503,6 @@ def depth_measures(
 # Occupancy of the floor: time per cell, spread by a Gaussian kernel (kernel density estimate).
 
 
-CELL_MM = 5.0
-SD_MM = 10.0  # of the kernel: about half a mouse's width
-_MOST_CELLS = 400  # along a side; larger floors have larger cells
-
-
 @dataclass(frozen=True)
 class Occupancy:
     """Time spent in each cell of the floor.
@@ -532,8 +527,7 @@ class Occupancy:
     @property
     def per_cm2(self) -> Array:
         """(ny, nx) time per area, s/cm²."""
-        area = np.outer(np.diff(self.y_mm), np.diff(self.x_mm)) / 100.0
-        return np.asarray(self.time_s / area)
+        return np.asarray(self.time_s / (np.outer(np.diff(self.y_mm), np.diff(self.x_mm)) / 100.0))
 
 
 def hold_times(time_s: ArrayLike) -> Array:
@@ -543,7 +537,11 @@ def hold_times(time_s: ArrayLike) -> Array:
 
 
 def occupancy(
-    xy_mm: ArrayLike, hold_s: ArrayLike, low_mm: ArrayLike, high_mm: ArrayLike, sd_mm: float = SD_MM
+    xy_mm: ArrayLike,
+    hold_s: ArrayLike,
+    low_mm: ArrayLike,
+    high_mm: ArrayLike,
+    sd_mm: float = 10.0,  # of the kernel: about half a mouse's width
 ) -> Occupancy:
     """Time spent in each cell of a rectangle of the floor.
 
@@ -562,7 +560,8 @@ def occupancy(
     hold = np.asarray(hold_s, float)[known]
     low = np.min([np.asarray(low_mm, float), *([xy.min(axis=0)] if len(xy) else [])], axis=0)
     high = np.max([np.asarray(high_mm, float), *([xy.max(axis=0)] if len(xy) else [])], axis=0)
-    cell = max(CELL_MM, float((high - low).max()) / _MOST_CELLS)
+    # along a side; larger floors have larger cells
+    cell = max(5.0, float((high - low).max()) / 400)
     edges = [
         a + cell * np.arange(max(int(np.ceil((b - a) / cell)), 1) + 1)
         for a, b in zip(low, high, strict=True)

@@ -207,8 +207,7 @@ def logged_of(animal: Mapping[str, Any]) -> tuple[DrawnMeasure, ...]:
         animal: the section `animal` of a session.json.
     """
     drawn = drawn_measures(animal)
-    bends = axis_of(animal).kind == STANDS
-    return (*drawn, DrawnMeasure(*_BEND)) if bends else drawn
+    return (*drawn, DrawnMeasure(*_BEND)) if (axis_of(animal).kind == STANDS) else drawn
 
 
 def _limb_names(body: BodyAxis) -> str:

@@ -33,9 +33,7 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
-_MOST_LAG_S = 0.25  # longest time of a wave for a third of the body
 # between the curvatures of two thirds of the body, for a wave to be accepted
-_LEAST_CORRELATION = 0.5
 
 
 class BoutReader:
@@ -239,11 +237,12 @@ class BoutReader:
             time[0], time[-1], 0.1 / self.fps
         )  # true times, on an even grid ten times as fine
         a, b = (np.interp(fine, time, curve) - curve.mean() for curve in (middle, rear))
-        most = min(int(_MOST_LAG_S * 10 * self.fps), len(fine) // 2)
+        # longest time of a wave for a third of the body
+        most = min(int(0.25 * 10 * self.fps), len(fine) // 2)
         agreement = [_correlation(a[: len(a) - lag], b[lag:]) for lag in range(most)]
         best = int(np.argmax(agreement)) if agreement else 0
         # at an end of the range the peak of the correlation is uncertain
-        if best in (0, most - 1) or agreement[best] < _LEAST_CORRELATION:
+        if best in (0, most - 1) or agreement[best] < 0.5:
             return np.nan
         return self.length_mm / 3.0 / (best * 0.1 / self.fps)
 

@@ -221,9 +221,8 @@ def _compare_one(
 
 def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:
     """The difference with its interval, both also as Hedges' g."""
-    second = (rows["group"] == groups[1]).to_numpy()
     animal = (
-        pd.factorize(rows["subject_id"])[0] * 2 + second
+        pd.factorize(rows["subject_id"])[0] * 2 + (rows["group"] == groups[1]).to_numpy()
     )  # an animal in both groups counts in both
     subjects, number = np.unique(animal, return_inverse=True)
     sd, correction = spread_of_animals(

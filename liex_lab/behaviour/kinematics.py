@@ -165,8 +165,7 @@ def tail_beat(
         near = np.minimum(np.append(np.inf, gap), np.append(gap, np.inf)) < 0.5 / SLOWEST_HZ
         rows = rows[near]  # a lone turning point is in a rest between two bouts
         extreme[rows] = shape["tail_angle_rad"][rows]
-        at = vertex_times(time_s, swing, rows, start, stop)
-        frequency = 0.5 / np.maximum(np.diff(at), 1e-9)
+        frequency = 0.5 / np.maximum(np.diff(vertex_times(time_s, swing, rows, start, stop)), 1e-9)
         fast = np.pad(frequency > TRUSTED_SHARE / step_s, 1)
         good = (frequency >= SLOWEST_HZ) & ~(fast[1:-1] | fast[:-2] | fast[2:])
         for k in np.flatnonzero(good):
@@ -247,7 +246,6 @@ IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
 # correlation time of errors; on rendered recordings it is longer, smoothed or not
 ERROR_LASTS_S = 0.3
 _BLOCK = 16_384  # frames in memory at a time
-STEEP_RAD = np.radians(75.0)  # beyond it the body's axis has no reliable direction on the floor
 
 
 @dataclass(frozen=True)
@@ -384,7 +382,8 @@ def _moving(
         velocity = spans[rows].rate(shape["centre"])
         fast = np.linalg.norm(velocity[:, :2] if kind == STANDS else velocity, axis=1)
         speed = np.where(fast > impossible_above_mm_s, np.nan, fast)
-        flat = np.abs(shape["body_pitch_rad"][rows]) < STEEP_RAD
+        # beyond it the body's axis has no reliable direction on the floor
+        flat = np.abs(shape["body_pitch_rad"][rows]) < np.radians(75.0)
         values = {
             "x_mm": centre[:, 0],
             "y_mm": centre[:, 1],
@@ -465,8 +464,7 @@ class Joints:
             """Positions (m, J, 3) mm and standard deviations (m, J) mm of the frames `rows`."""
             part = track[rows]
             xyz = np.where(part.bridged[:, None, None], np.nan, part.joints_mm)
-            sd = part.sd_mm.copy()
-            return _apart(list(np.moveaxis(xyz, -1, 0))), sd
+            return _apart(list(np.moveaxis(xyz, -1, 0))), part.sd_mm.copy()
 
         parents = tuple(int(joint) for joint in track.skeleton.parents)
         return Joints(list(track.skeleton.names), track.n_frames, at, parents)

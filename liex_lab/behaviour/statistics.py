@@ -477,12 +477,11 @@ def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[floa
     except (np.linalg.LinAlgError, ValueError):
         return None
     error = float(result.bse_fe[1])
-    variance = float(np.asarray(result.cov_re)[0, 0])
     if (
         not result.converged
         or not np.isfinite(error)
         or error <= 0
-        or variance < 1e-4 * float(result.scale)
+        or float(np.asarray(result.cov_re)[0, 0]) < 1e-4 * float(result.scale)
     ):
         return None
     return float(result.fe_params[1]) * scale, error * scale

@@ -149,11 +149,10 @@ def measure(
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
     words = Vocabulary(tuple(actions), tuple(around.zones), kind_of(moved))
     gaps = empty_table(GAPS) if gaps is None else gaps
-    summary = summarise(frames, moved, named, words, around, rules)
     return Behaviour(
         moved,
         named,
-        summary,
+        summarise(frames, moved, named, words, around, rules),
         transitions(named, words.words, gaps, rules.merge_pauses_s),
         activity(moved, named, words.words),
         visits(frames, moved, words.zones, rules),
@@ -228,10 +227,9 @@ def measure_session(session: SessionTables, rules: MouseRules | None = None) -> 
     stated, around = stated_by(session)
     poses = session.table("poses", ["frame_index", "joint", "x_mm", "y_mm", "z_mm", "sd_mm"])
     frames = session.frames
-    parents = parents_of(session.metadata["animal"])
     return measure(
         frames,
-        Joints.of_table(poses, len(frames), parents),
+        Joints.of_table(poses, len(frames), parents_of(session.metadata["animal"])),
         rules or stated,
         around,
         session.gaps,

@@ -44,11 +44,8 @@ OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES, "resumed.rrd")  # not in the fin
 LOGS = ("session.rrd", "session.mcap")
 # an .rrd file: a header, then messages that begin with kind and length, 8 bytes each
 RRD_HEAD = 12  # magic, version and options
-_RRD_END = 0  # kind of the message that ends a stream
 _BLOCK = 1 << 22
 _RESUMED = "resumed.rrd"
-_LOG_NAMES = r"^(session\.rrd|resumed\.rrd|session\.mcap)$"
-Clock = Callable[[], float]
 
 
 class State(BaseModel):
@@ -67,7 +64,10 @@ class State(BaseModel):
     n_frames: NonNegativeInt = 0
     seconds: Annotated[float, Field(ge=0.0, lt=_MOST_S)] = 0.0
     interruptions: NonNegativeInt = 0
-    logs: dict[Annotated[str, Field(pattern=_LOG_NAMES)], NonNegativeInt] = {}
+    logs: dict[
+        Annotated[str, Field(pattern=r"^(session\.rrd|resumed\.rrd|session\.mcap)$")],
+        NonNegativeInt,
+    ] = {}
 
 
 class Checkpoint:
@@ -83,7 +83,7 @@ class Checkpoint:
     """
 
     def __init__(
-        self, folder: Path, facts: Mapping[str, Any], clock: Clock = time.monotonic
+        self, folder: Path, facts: Mapping[str, Any], clock: Callable[[], float] = time.monotonic
     ) -> None:
         """Begin, or resume a session with the same provenance.
 
@@ -104,8 +104,7 @@ class Checkpoint:
         self._held = _locked(folder)
         self.folder = folder
         self._clock = clock
-        text = json.dumps(facts, sort_keys=True, default=str)
-        key = hashlib.sha256(text.encode()).hexdigest()
+        key = hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
         state = None
         with suppress(OSError, ValueError):  # nothing to resume from
             state = State.model_validate_json((folder / _STATE).read_bytes())
@@ -208,8 +207,7 @@ class Checkpoint:
     def _cut(self, state: State) -> bool:
         """Truncate everything to the checkpoint; False if a file is shorter than recorded."""
         for path in self.folder.iterdir():  # incomplete tables, and logs without a checkpoint
-            own = path.name in OWN and path.name != _RESUMED
-            if not own and path.name not in state.logs:
+            if not (path.name in OWN and path.name != _RESUMED) and path.name not in state.logs:
                 _remove(path)
         for log, size in state.logs.items():
             if _size(self.folder / log) < size:
@@ -338,7 +336,8 @@ def rrd_messages(path: Path, start: int = RRD_HEAD) -> Iterator[tuple[int, int]]
                 raise SessionError(
                     "the replay was not written whole; make room on the disk and run it again"
                 )
-            if kind == _RRD_END:
+            # kind of the message that ends a stream
+            if kind == 0:
                 return
             yield at, 16 + length
             at += 16 + length

@@ -34,14 +34,10 @@ from liex_lab.tables.rows import frame_count, stop_times
 Array = NDArray[np.float64]
 
 _ROUNDED_S = 5e-4  # times are typed with three decimals
-_INSET_FRAMES = 24  # sampled for the depth of a joint below the skin
 _WORD_LENGTH = 60
 # shares of the animal's length: its least distance in front of the still scene, and its largest
 # from the nearest joint (half of that if the scene is unknown and the floor is used instead)
-_STANDS_OUT = 0.05
 _BESIDE = 0.5
-_SCENE_FRAMES = 256  # sampled for the still scene
-_APART_S = 0.5  # turns after a longer time without a pose are ignored
 SENTENCES = (  # seconds since the first frame; a pixel u v, or a position x y z in mm of the arena
     "flip FROM TO",
     "joint NAME FRAME U V",
@@ -152,7 +148,8 @@ def disagreements(session: Session) -> list[str]:
     rows = np.flatnonzero(np.isfinite(ahead).all(axis=1))
     cosine = np.zeros(len(index))  # of the turn from the previous frame with a pose
     cosine[rows[1:]] = (ahead[rows[1:]] * ahead[rows[:-1]]).sum(axis=1)
-    apart = set(rows[1:][np.diff(time_s[rows]) > _APART_S].tolist())
+    # turns after a longer time without a pose are ignored
+    apart = set(rows[1:][np.diff(time_s[rows]) > 0.5].tolist())
     half_turns = set(np.flatnonzero(cosine < 0.0).tolist()) - apart
     ends_s = np.append(time_s, stop_times(time_s)[-1:])
     path = shlex.quote(str(session.path))
@@ -296,7 +293,8 @@ def _skin_under(
     if not kept.holds(row, u_px, v_px):
         return math.nan  # the still scene
     skin_mm = depth_under(recording.frame(row).depth, u_px, v_px)
-    rows = np.linspace(0, len(session.frames) - 1, _SCENE_FRAMES).astype(int).tolist()
+    # sampled for the still scene
+    rows = np.linspace(0, len(session.frames) - 1, 256).astype(int).tolist()
     empty = next((k for k in rows if not kept.holds(k, u_px, v_px)), None)
     scene_mm = math.nan if empty is None else depth_under(recording.frame(empty).depth, u_px, v_px)
     pixel = np.array([u_px, v_px])
@@ -306,7 +304,7 @@ def _skin_under(
     )
     away_mm = np.linalg.norm(_joints(session)[row] - point, axis=-1).min()
     length = float(session.frames["spine_mm"].iloc[row])
-    return skin_mm if stands_mm > _STANDS_OUT * length and away_mm < reach * length else math.nan
+    return skin_mm if stands_mm > 0.05 * length and away_mm < reach * length else math.nan
 
 
 def depth_under(depth: NDArray[Any], u_px: float, v_px: float) -> float:
@@ -330,7 +328,8 @@ def _inset_mm(session: Session, recording: Recording, kept: Kept, joint: str) ->
     usable = np.flatnonzero(
         (frames["flag"].to_numpy() == "") & np.isfinite(poses["u_px"].to_numpy(float))
     )
-    sample = np.linspace(0, len(usable) - 1, _INSET_FRAMES if len(usable) else 0).astype(int)
+    # sampled for the depth of a joint below the skin
+    sample = np.linspace(0, len(usable) - 1, 24 if len(usable) else 0).astype(int)
     uv = poses[["u_px", "v_px"]].to_numpy(float)
     places = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
     into = session.T_arena_camera.inverse()
@@ -383,8 +382,7 @@ def add_bout(
         SessionError: the span has no frame, or the word is unknown.
         LiexError: the action is not a printable word of up to 60 letters.
     """
-    word = _word(session, action, new_word)
-    return BoutEdit("add", word, *span_ns(session, start_s, stop_s))
+    return BoutEdit("add", _word(session, action, new_word), *span_ns(session, start_s, stop_s))
 
 
 def rename_bout(session: Session, at_s: float, action: str, *, new_word: bool = False) -> BoutEdit:

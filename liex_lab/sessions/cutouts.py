@@ -44,17 +44,6 @@ from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
 
-_ONCE = 1_200_000
-_A_FRAME = 1_000
-_A_JOINT = 260
-_A_CUTOUT = 1_500
-_COPIES = 2
-_THUMBNAILS = 16
-_THUMBNAIL_SIDE = 2.3  # lengths of the animal
-_CUTOUT_SIDE = 1.1
-_CUTOUT_PX = 8.0
-_LEVEL = 3  # of Zstandard, as in the logs
-
 Depth = NDArray[np.uint16]
 Boxes = NDArray[np.int16]
 
@@ -65,7 +54,6 @@ ALL = "all"
 NONE = "none"
 N_BOXES = 2  # objects per frame
 _FRAMES = 16  # from which the background is learned
-_LARGEST = 4.0  # usual areas of the animal; larger objects are not resting animals
 _REACH = 0.7  # of the square root of an object's pixels, to each side of its centroid
 _MARGIN = 0.15  # of the spine
 _MARGIN_PX = 4.0
@@ -104,10 +92,10 @@ def _without_animals(image: Depth, known: BackgroundSubtraction) -> Depth:
     limit, background = (
         at_every_pixel(values, step, image.shape) for values in (known.limit, known.background)
     )
-    stands = (image > 0) & (image < limit)
-    _, labels = cv2.connectedComponents(stands.astype(np.uint8))
+    _, labels = cv2.connectedComponents(((image > 0) & (image < limit)).astype(np.uint8))
     areas = np.bincount(labels.ravel(), image.ravel().astype(np.float64) ** 2)
-    rests = areas / (known.camera.fx * known.camera.fy) < _LARGEST * known.area_mm2
+    # usual areas of the animal; larger objects are not resting animals
+    rests = areas / (known.camera.fx * known.camera.fy) < 4.0 * known.area_mm2
     rests[0] = False  # the background itself
     # the animal's edge is below the segmentation's limit
     around = np.ones((2 * step + 3, 2 * step + 3), np.uint8)
@@ -299,8 +287,7 @@ def meant_to_keep_depth(session: Session) -> bool:
     Args:
         session: the session; plans of earlier versions have a boolean, or no value.
     """
-    plan = session.metadata.get("plan", {})
-    return plan.get("replay", {}).get("depth", ALL) not in (NONE, False)
+    return session.metadata.get("plan", {}).get("replay", {}).get("depth", ALL) not in (NONE, False)
 
 
 def open_depth(session: Session) -> Recording:
@@ -393,18 +380,16 @@ def needed_bytes(
         length_px: length of the animal in the image.
         kept: extent of the kept depth, as in `[replay] depth`.
     """
-    packer = zstandard.ZstdCompressor(level=_LEVEL)
+    packer = zstandard.ZstdCompressor(level=3)  # as in the logs
     packed = sum(len(packer.compress(np.ascontiguousarray(image).tobytes())) for image in images)
     whole = sum(image.size for image in images)
     a_pixel = packed / max(whole, 1)
-    a_frame = _A_FRAME + _A_JOINT * n_joints
+    a_frame = 1_000 + 260 * n_joints
     if kept != NONE:
         an_image = whole / max(len(images), 1)
-        around = min((_CUTOUT_SIDE * length_px + _CUTOUT_PX) ** 2, an_image)
-        kept_px = around if kept == ANIMAL else an_image
-        a_frame += int(_COPIES * (a_pixel * kept_px + (0 if kept == ALL else _A_CUTOUT)))
-    thumbnails = _THUMBNAILS * (_THUMBNAIL_SIDE * length_px) ** 2 * a_pixel
-    return _ONCE + int(thumbnails) + n_frames * a_frame
+        kept_px = min((1.1 * length_px + 8.0) ** 2, an_image) if kept == ANIMAL else an_image
+        a_frame += int(2 * (a_pixel * kept_px + (0 if kept == ALL else 1_500)))
+    return 1_200_000 + int(16 * (2.3 * length_px) ** 2 * a_pixel) + n_frames * a_frame
 
 
 # Thumbnails of depth images, cut around the animal, for the report.
@@ -412,7 +397,6 @@ def needed_bytes(
 
 _KEPT = 32  # most whole frames kept of a recording of unknown length
 _SHOWN = 16
-_HALF_SPINES = 1.15  # half the side of a thumbnail, in spine lengths
 
 
 class Thumbnails:
@@ -513,14 +497,14 @@ class Thumbnails:
         near = depth[depth > 0]
         distance = float(np.median(near)) if len(near) else 1000.0
         spine_px = float(rows.track.spine_mm[row]) * camera.fx / distance
-        half_px = int(np.ceil(max(_HALF_SPINES * spine_px, 1.3 * extent, 16.0)))
+        # half the side of a thumbnail, in spine lengths
+        half_px = int(np.ceil(max(1.15 * spine_px, 1.3 * extent, 16.0)))
         left = int(np.round(centre[0])) - half_px
         top = int(np.round(centre[1])) - half_px
         side = 2 * half_px
         around = 2 * side  # an animal may reach out of the image
         row_px, column_px = top + around, left + around
-        padded = np.pad(depth, around)
-        square = padded[row_px : row_px + side, column_px : column_px + side]
+        square = np.pad(depth, around)[row_px : row_px + side, column_px : column_px + side]
         return left, top, square
 
 

@@ -33,12 +33,7 @@ from liex_lab.tracking.track import Flip, Subject, Track
 Array = NDArray[np.float64]
 
 FILE = "observations.npz"
-_SCALARS = ("scale", "predicted_error_mm", "residual_mm", "n_foreground_px", "p_flip", "bridged")
 _ADDRESS = "synthetic:"
-# columns that sessions of earlier versions lack
-_LATER = ("covered", "beside", "behind", "part_mm", "repeats")
-_BYTES_PER_JOINT = 1 << 10  # upper limit per frame, several times the true size
-_SPARE_BYTES = 1 << 26  # for the skeleton and its mesh
 
 
 @dataclass(frozen=True)
@@ -108,11 +103,10 @@ class Results:
         origin = self.origin
         observed = rows.track.observed
         step = median_step(rows.time_s)
-        subject = {name: origin.subject.get(name, "") for name in WHO}
         return {
             "session_id": rows.session_id,
             "individual": rows.individual,
-            **subject,
+            **{name: origin.subject.get(name, "") for name in WHO},
             "session_start_time": origin.session_start_time,
             "n_frames": rows.track.n_frames,
             "n_frames_observed": int(observed.sum()),
@@ -174,7 +168,8 @@ def _opened(session: Session) -> Iterator[Any]:
     n_joints = len(session.metadata["animal"]["joints"])
     n_frames = session.metadata["frames"]["n_frames"]
     with reading_from(session.path / FILE) as path:
-        memory.check_npz(path, _SPARE_BYTES + n_frames * (n_joints + 1) * _BYTES_PER_JOINT)
+        # several times the true size per frame, and 64 MiB for the skeleton and its mesh
+        memory.check_npz(path, (1 << 26) + n_frames * (n_joints + 1) * (1 << 10))
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield arrays
 
@@ -204,7 +199,8 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
         columns = []
         for name in COLUMNS:
             expected = getattr(empty, name)
-            found = expected if name in _LATER and name not in arrays else arrays[name]
+            later = name in ("covered", "beside", "behind", "part_mm", "repeats")
+            found = expected if later and name not in arrays else arrays[name]
             if (found.shape, found.dtype) != (expected.shape, expected.dtype):
                 raise ValueError(
                     f"{name} is {found.dtype} {found.shape}, not {expected.dtype} {expected.shape}"
@@ -419,7 +415,14 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     above, below = np.triu_indices(6, 1)
     pairs = _columns(rotations.iloc[:: j + 1], list(tables.ROOT_COVARIANCES))
     covariance[:, above, below] = covariance[:, below, above] = pairs
-    for name in _SCALARS:
+    for name in (
+        "scale",
+        "predicted_error_mm",
+        "residual_mm",
+        "n_foreground_px",
+        "p_flip",
+        "bridged",
+    ):
         if name in frames:
             getattr(track, name)[:] = frames[name].to_numpy()
     track.centroid_mm[:] = _columns(frames, [f"centroid_{a}_mm" for a in "xyz"])

@@ -24,9 +24,6 @@ from liex_lab.sessions.provenance import versions
 
 FAILED_FILE = "failed.json"
 _TAKEN = "corrected.taken"  # in an outdated copy: corrections inherited by a later session
-_LOGS = {".rrd", ".mcap"}
-_HASHED = {".parquet", ".csv", ".json", ".toml"}
-_SURE = 0.5  # of the estimated size: least free space to begin with
 
 
 def describe_failure(error: BaseException, stage: str, frame: int | None) -> dict[str, Any]:
@@ -172,9 +169,9 @@ def file_facts(folder: Path) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for path in sorted(folder.iterdir()):
-        if path.suffix in _LOGS and path.name not in OWN:
+        if path.suffix in {".rrd", ".mcap"} and path.name not in OWN:
             found[path.name] = {"bytes": path.stat().st_size}
-        elif path.suffix in _HASHED and path.name not in OWN:
+        elif path.suffix in {".parquet", ".csv", ".json", ".toml"} and path.name not in OWN:
             found[path.name] = {"bytes": path.stat().st_size, "sha256": sha256(path)}
     return found
 
@@ -195,7 +192,8 @@ def check_room(folder: Path, needed: int) -> None:
     nearest = next(place for place in folder.absolute().parents if place.is_dir())
     written = folder_bytes(part_folder(folder))
     free = shutil.disk_usage(nearest).free
-    if free < _SURE * (needed - written):
+    # of the estimated size: least free space to begin with
+    if free < 0.5 * (needed - written):
         raise SessionError(
             f"the session takes about {megabytes(needed - written)} and the disk that holds "
             f"{nearest} has {megabytes(free)} free; make room there, choose another place (--out, "
@@ -342,8 +340,7 @@ def taken_from(path: Path) -> str:
 
 def _waits(path: Path) -> bool:
     """Whether a session was moved aside and not replaced."""
-    there = (path / "session.json").is_file()
-    return not there and (aside_folder(path) / "session.json").is_file()
+    return not (path / "session.json").is_file() and (aside_folder(path) / "session.json").is_file()
 
 
 def _free(path: Path) -> Path:

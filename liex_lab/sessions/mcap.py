@@ -180,8 +180,7 @@ class McapLog:
         chunk = self._open
         if topic not in self._introduced:  # in the chunk of its first message
             self._introduced.add(topic)
-            schema = self._schemas[self._topics[topic].name]
-            chunk.put(_bytes_of(schema) + _bytes_of(channel))
+            chunk.put(_bytes_of(self._schemas[self._topics[topic].name]) + _bytes_of(channel))
         index = chunk.indexes.setdefault(channel.id, MessageIndex(channel.id, []))
         index.records.append((time_ns, chunk.size))
         number = self._counts[channel.id] + len(index.records)
@@ -278,7 +277,6 @@ Array = NDArray[np.float64]
 
 _SECOND = 10**9
 _BLOCK = 8192  # frames of a track in memory at a time
-_DATA = b"\x32"  # tag of the pixels' field of RawImage: number 6, bytes
 _TIME = {
     "type": "object",
     "title": "time",
@@ -617,11 +615,11 @@ def _raw_image(time_ns: int | np.int64, image: NDArray[np.uint16]) -> list[bytes
     before = messages.RawImage(
         timestamp=_stamp(time_ns), encoding="16UC1", width=width, height=height, step=2 * width
     )
-    after = messages.RawImage(frame_id="camera")
     return [
-        before.encode() + _DATA + bytes(varint),
+        # tag of the pixels' field of RawImage: number 6, bytes
+        before.encode() + b"\x32" + bytes(varint),
         pixels.reshape(-1).view(np.uint8).data,
-        after.encode(),
+        messages.RawImage(frame_id="camera").encode(),
     ]
 
 

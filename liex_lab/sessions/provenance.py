@@ -251,9 +251,7 @@ def _hash(value: Any) -> str:
 THUMBNAILS = "thumbnails"  # folder of a session
 _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 1 << 31
-_MOST_JOINTS = 1000
 _MOST_PX = 1 << 15
-_DAMAGED = (OSError, ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError)
 _ESCAPED = re.compile(r"\\u(0000|[dD][89a-fA-F])")
 
 
@@ -328,7 +326,7 @@ class _Shape(_Section):
 
 class _Animal(_Section):
     name: Name
-    joints: Annotated[list[Name], Field(min_length=1, max_length=_MOST_JOINTS)]
+    joints: Annotated[list[Name], Field(min_length=1, max_length=1000)]
     bones: list[Annotated[list[int], Field(min_length=2, max_length=2)]]
     home_length_mm: Finite
     spine_mm: Finite | None = None
@@ -487,7 +485,7 @@ def read_document(path: Path) -> dict[str, Any]:
             Zone.from_dict(zone)
         if _ESCAPED.search(text):
             _walk(found)
-    except _DAMAGED as error:
+    except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
         why = _first(error) if isinstance(error, ValidationError) else str(error)
         raise SessionError(
             f"{path} is damaged and cannot be read ({(why or type(error).__name__)[:200]}); run "

@@ -35,7 +35,6 @@ NO_NAME = ""  # time without an action
 PROGRAM = "the program"
 MOST_CLIPS = 500
 _NAME_LENGTH = 60
-_LEAST_S = 0.3  # shorter intervals between bouts are not drawn
 
 
 @dataclass(frozen=True)
@@ -118,8 +117,7 @@ class Review:
         found = []
         for a, b in combinations(labels, 2):
             both = sorted(set(labels[a]) & set(labels[b]))
-            words = ([labels[one][k] for k in both] for one in (a, b))
-            found.append((a, b, cohens_kappa(*words)))
+            found.append((a, b, cohens_kappa(*([labels[one][k] for k in both] for one in (a, b)))))
         return found
 
     def to_json(self) -> str:
@@ -207,7 +205,8 @@ def _bouts_of(session: Session) -> list[tuple[str, float, float, float]]:
         *table[["action", "start_s", "stop_s"]].itertuples(index=False, name=None),
         ("", last_s, last_s),
     ]:
-        if start_s - at_s > _LEAST_S:
+        # shorter intervals between bouts are not drawn
+        if start_s - at_s > 0.3:
             found.append((NO_NAME, at_s, float(start_s), last_s))
         if word:
             found.append((str(word), float(start_s), float(stop_s), last_s))

@@ -49,7 +49,6 @@ from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
-DepthBatch = Sequence[NDArray[np.uint16]]
 
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"
@@ -58,10 +57,6 @@ CANDIDATES = "arena/candidates"
 ACTIONS = "ethogram/predicted"
 TRACKING = "ethogram/tracking"
 _BLOCK = 8192  # frames of small data sent at once
-# time per turn of waiting for a flush, and longest time without growth of the file
-_TURN_S = 2.0
-_PATIENCE_S = 60.0
-
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
     "not_found": int(vocabulary.NO_POSE[1:], 16),
@@ -70,9 +65,10 @@ _FLAG_COLOURS = {
     "repeated": 0x66CCEE,
     "corrected": 0x4477AA,
 }
-_WORST = 12
-_HOLDS_95 = 2.795  # standard deviations of a Gaussian in space
-_SPREAD = [255, 170, 60, 140]
+# time per turn of waiting for a flush, and longest time without growth of the file
+_TURN_S = 2.0
+_PATIENCE_S = 60.0
+
 BONE_COLOUR = [255, 255, 255, 255]
 JOINT_COLOUR = [255, 80, 60, 255]
 
@@ -129,7 +125,7 @@ class ReplayWriter:
         self,
         frame_index: Sequence[int],
         times_ns: Sequence[int],
-        depth: DepthBatch,
+        depth: Sequence[NDArray[np.uint16]],
         boxes: Boxes | None = None,
     ) -> None:
         """Write depth of consecutive frames; nothing without depth.
@@ -354,7 +350,7 @@ class ReplayWriter:
             f"{OVERLAY}/joints": rr.Points2D.from_fields(radii=thick, **dot),
             f"{OVERLAY}/bones": rr.LineStrips2D.from_fields(radii=thin, colors=BONE_COLOUR),
             UNCERTAINTY: rr.Ellipsoids3D.from_fields(
-                colors=_SPREAD, fill_mode="majorwireframe", line_radii=0.0003
+                colors=[255, 170, 60, 140], fill_mode="majorwireframe", line_radii=0.0003
             ),
         }
         if track.posed.any():
@@ -378,7 +374,7 @@ class ReplayWriter:
     def _log_worst(self, predicted_error_mm: Array) -> None:
         """Log the frames with the largest predicted error, as notes to jump to."""
         error = np.nan_to_num(predicted_error_mm)
-        worst = np.sort(np.argsort(-error, kind="stable")[:_WORST])
+        worst = np.sort(np.argsort(-error, kind="stable")[:12])
         worst = worst[error[worst] > 0]
         if len(worst):
             notes = [f"frame {self._index[k]}: predicted error {error[k]:.1f} mm" for k in worst]
@@ -481,7 +477,8 @@ def _skeleton_columns(track: Track) -> Iterator[tuple[str, Any]]:
         strips = line.columns(strips=points[:, edges].reshape(-1, 2, size).astype(np.float32))
         yield f"{entity}/joints", dots.partition(np.where(posed, n_joints, 0))
         yield f"{entity}/bones", strips.partition(np.where(posed, len(edges), 0))
-    axes = _HOLDS_95 * np.nan_to_num(track.sd_xyz_mm[posed]).reshape(-1, 3) / MM_PER_UNIT
+    # standard deviations of a Gaussian in space
+    axes = 2.795 * np.nan_to_num(track.sd_xyz_mm[posed]).reshape(-1, 3) / MM_PER_UNIT
     spheres = rr.Ellipsoids3D.columns(half_sizes=axes, centers=joints.reshape(-1, 3))
     yield UNCERTAINTY, spheres.partition(np.where(posed, n_joints, 0))
 

@@ -55,15 +55,9 @@ BACKGROUND = f"{IMAGE}/background"
 PLACES = f"{IMAGE}/places"
 CUTOUTS = "arena/camera/cutouts"
 MM_PER_UNIT = 1000.0  # our depth is in mm, the scene in metres
-# drawing order in the image; whole images may cover the cut-outs
-_BACKMOST = -40.0
-_BEHIND = -30.0
-_WHOLE = -20.0
 # media types
 _RVL = "application/rvl"
 _PNG = "image/png"
-_LARGE = 0.54  # bytes per pixel: 166 kB for 640 x 480
-_PACKED_FURTHER = 0.93  # by Rerun's own compression: RVL by this factor, PNG not at all
 # OpenCV's IMWRITE_PNG_COMPRESSION 1 and IMWRITE_PNG_STRATEGY 2, HUFFMAN_ONLY
 _NOISY_PNG = (16, 1, 17, 2)
 # images, and their bytes, per message: the index at the file's end needs some 5 kB of memory
@@ -152,9 +146,7 @@ class DepthColumns:
             if shows.any() and entity.startswith(CUTOUTS) and entity not in self._introduced:
                 assert self._origin.background is not None
                 style = self._style(self._origin.background)
-                kind = rr.EncodedDepthImage.from_fields(
-                    **style, media_type=_RVL, draw_order=_BEHIND
-                )
+                kind = rr.EncodedDepthImage.from_fields(**style, media_type=_RVL, draw_order=-30.0)
                 stream.log(entity, kind, static=True)
                 self._introduced.add(entity)
             columns = rr.EncodedDepthImage.columns(
@@ -168,8 +160,7 @@ class DepthColumns:
     def _send_lens(self, stream: Any, k: int, waiting: Sequence[_KeptImage]) -> None:
         """Send the intrinsics of the k-th cut-out of frames, and its position in the image."""
         boxes = np.array([image.windows[k] for image in waiting], np.float64)
-        there = boxes[:, 2] > boxes[:, 0]
-        if not there.any() and k:
+        if not (boxes[:, 2] > boxes[:, 0]).any() and k:
             return
         n = len(boxes)
         lens = np.tile(self._origin.camera.matrix, (n, 1, 1))
@@ -178,9 +169,8 @@ class DepthColumns:
             image_from_camera=lens,
             resolution=np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0),
         )
-        corners = np.hstack([boxes[:, :2], np.zeros((n, 1))])
         places = rr.Transform3D.columns(
-            translation=corners,
+            translation=np.hstack([boxes[:, :2], np.zeros((n, 1))]),
             child_frame=[cutout_frame(k)] * n,
             parent_frame=[f"tf#/{IMAGE}"] * n,
         )
@@ -200,18 +190,19 @@ class DepthColumns:
         if whole:
             for entity, media_type in ((DEPTH, _RVL), (NOISY, _PNG)):
                 kind = rr.EncodedDepthImage.from_fields(
-                    **self._style(first), media_type=media_type, draw_order=_WHOLE
+                    **self._style(first),
+                    media_type=media_type,
+                    draw_order=-20.0,
                 )
                 stream.log(entity, kind, static=True)
             return
 
         assert self._origin.background is not None
-        blob = cv2.imencode(".png", self._origin.background)[1].ravel()
         scene = rr.EncodedDepthImage(
-            blob=blob,
+            blob=cv2.imencode(".png", self._origin.background)[1].ravel(),
             media_type=_PNG,
             **self._style(self._origin.background),
-            draw_order=_BACKMOST,
+            draw_order=-40.0,
         )
         stream.log(BACKGROUND, scene, static=True)
 
@@ -288,9 +279,11 @@ def packed(depth: NDArray[np.uint16]) -> tuple[NDArray[np.uint8], str]:
         The bytes, and their media type: 'application/rvl' or 'image/png'.
     """
     rvl = rvl_message(depth)
-    if len(rvl) > _LARGE * depth.size:
+    # bytes per pixel: 166 kB for 640 x 480
+    if len(rvl) > 0.54 * depth.size:
         png = cv2.imencode(".png", depth, _NOISY_PNG)[1].ravel()
-        if len(png) < _PACKED_FURTHER * len(rvl):
+        # by Rerun's own compression: RVL by this factor, PNG not at all
+        if len(png) < 0.93 * len(rvl):
             return png, _PNG
     return rvl, _RVL
 
@@ -333,10 +326,8 @@ OVERLAY: Final = f"{IMAGE}/overlay"
 FLOOR: Final = "arena/floor"
 BODY: Final = "arena/body"
 PALETTE = tuple(int(colour[1:], 16) for colour in vocabulary.PALETTE)
-_WALL = 0x9AA0A6
 _GREY: Final = [154, 160, 166, 255]
 _PURPLE: Final = [170, 51, 119, 255]
-_SKIN = [176, 190, 205, 150]
 
 
 def rgba(colours: Iterable[int]) -> NDArray[np.uint32]:
@@ -363,7 +354,7 @@ def log_camera(stream: Any, camera: Camera, T_arena_camera: SE3) -> None:
 def log_outlines(stream: Any, origin: Provenance) -> None:
     """Log walls and zones, on the floor and over the depth image."""
     walls = origin.arena.outline_mm()
-    drawn = [("walls", "", walls, _WALL)] if len(walls) else []
+    drawn = [("walls", "", walls, 0x9AA0A6)] if len(walls) else []
     for zone, colour in zip(origin.zones, cycle(PALETTE), strict=False):
         part = f"zones/{rr.escape_entity_path_part(zone.name)}"
         drawn.append((part, zone.name, zone.outline_mm(), colour))
@@ -510,7 +501,7 @@ def log_body(stream: Any, skeleton: Skeleton, animal: Mapping[str, Any]) -> list
             vertex_positions=part.vertices / 1000.0,
             triangle_indices=part.faces,
             vertex_normals=part.normals,
-            albedo_factor=_SKIN,
+            albedo_factor=[176, 190, 205, 150],
         )
         stream.log(_body_entity(skeleton, part.joint), mesh, static=True)
     return [part.joint for part in parts]
@@ -547,15 +538,13 @@ def _body_entity(skeleton: Skeleton, joint: int) -> str:
 _MOST_MM = 3.0
 _OF_BONE = 0.3
 _MOST_PT = 3.5
-_LEAST_PT = 1.5
 
 
 def dot_mm(skeleton: Skeleton) -> float:
     """Radius of a joint in space, mm: 0.3 of the median bone of the skeleton, at most 3."""
-    bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
-    return float(min(_MOST_MM, _OF_BONE * np.median(bones)))
+    return float(min(_MOST_MM, _OF_BONE * np.median(np.linalg.norm(skeleton.offsets[1:], axis=1))))
 
 
 def dot_pt(skeleton: Skeleton) -> float:
     """Radius of a joint over an image, in screen points: at most 3.5, at least 1.5."""
-    return max(_LEAST_PT, _MOST_PT * float(np.sqrt(dot_mm(skeleton) / _MOST_MM)))
+    return max(1.5, _MOST_PT * float(np.sqrt(dot_mm(skeleton) / _MOST_MM)))

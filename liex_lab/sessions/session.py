@@ -40,41 +40,30 @@ from liex_lab.tracking.track import CORRECTED
 if TYPE_CHECKING:
     import xarray
 
-FILES = (
-    "session.json",
-    "plan.toml",
-    "frames.parquet",
-    "poses.parquet",
-    "rotations.parquet",
-    "kinematics.parquet",
-    "bouts.parquet",
-    "gaps.parquet",
-    "flips.parquet",
-    "sessions.parquet",
-    "summary.csv",
-    "transitions.parquet",
-    "activity.parquet",
-    "zones.parquet",
-    "columns.json",
-    "session.rrd",
-    "session.mcap",
-    "observations.npz",
-    "cutouts.npz",
-    "replay.rbl",
-    "foxglove.json",
-)
-PULSE = next(column for column in FRAMES if column.name == "pulse_index")
-_OPTIONAL = {
-    "kinematics.parquet",
-    "summary.csv",
-    "transitions.parquet",
-    "activity.parquet",
-    "zones.parquet",
-    "observations.npz",
-    "cutouts.npz",
-    "replay.rbl",
-    "foxglove.json",
+FILES = {  # of a session, and whether every version writes it
+    "session.json": True,
+    "plan.toml": True,
+    "frames.parquet": True,
+    "poses.parquet": True,
+    "rotations.parquet": True,
+    "kinematics.parquet": False,
+    "bouts.parquet": True,
+    "gaps.parquet": True,
+    "flips.parquet": True,
+    "sessions.parquet": True,
+    "summary.csv": False,
+    "transitions.parquet": False,
+    "activity.parquet": False,
+    "zones.parquet": False,
+    "columns.json": True,
+    "session.rrd": True,
+    "session.mcap": True,
+    "observations.npz": False,
+    "cutouts.npz": False,
+    "replay.rbl": False,
+    "foxglove.json": False,
 }
+PULSE = next(column for column in FRAMES if column.name == "pulse_index")
 
 
 class Session:
@@ -132,7 +121,7 @@ class Session:
             )
         metadata = read_document(document)
         for name in FILES:
-            if name not in _OPTIONAL and not (folder / name).is_file():
+            if FILES[name] and not (folder / name).is_file():
                 raise SessionError(
                     f"the session {folder} lacks {name}; run `liex run` on the recording again"
                 )
@@ -463,7 +452,6 @@ def found_video(session: Session, what: str = "") -> Path | None:
 
 Array = NDArray[np.float64]
 _KEPT = 0.6  # the usual threshold of likelihoods: least value in trusted frames
-_UNSURE = 0.5  # the highest likelihood in other frames
 
 
 @dataclass(frozen=True, repr=False)
@@ -511,7 +499,8 @@ class PoseArrays:
         usual threshold of 0.6 keeps trusted frames.
         """
         sure = self.trusted[:, None]
-        return np.where(sure, _KEPT + (1.0 - _KEPT) * self.score, _UNSURE * self.score)
+        # the highest likelihood in other frames
+        return np.where(sure, _KEPT + (1.0 - _KEPT) * self.score, 0.5 * self.score)
 
     @staticmethod
     def of(about: Mapping[str, Any], table: pd.DataFrame, frames: pd.DataFrame) -> PoseArrays:

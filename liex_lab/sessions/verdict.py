@@ -22,9 +22,6 @@ from liex_lab.tracking.track import Track
 LOOK_AT_IT = "look at it"
 CAUTION = "note"
 OTHER_ANIMAL = "the recording names another animal"  # start of that caution
-_MEASURED_SHARE = 0.5  # of the frames with an object of the animal's size in view
-_LEAST_SHARE = 0.2  # of all frames with depth
-_DOUBTFUL_SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -89,9 +86,11 @@ class Verdict:
         n_doubtful = int((track.flag == "doubtful").sum())
         errors = track.predicted_error_mm[track.observed]
         reasons = [*misfits, *doubts]
-        if n_trusted < _LEAST_SHARE * n_depth:
+        # of all frames with depth
+        if n_trusted < 0.2 * n_depth:
             reasons.append(f"an animal is measured in {n_trusted} of {n_depth} frames only")
-        elif n_trusted < _MEASURED_SHARE * n_in_view:
+        # of the frames with an object of the animal's size in view
+        elif n_trusted < 0.5 * n_in_view:
             reasons.append(
                 f"only {n_trusted} of the {n_in_view} frames with an object of its size in view "
                 "are measured and trusted"
@@ -101,7 +100,7 @@ class Verdict:
             notes.append(f"{n_animals} animals are in view and one of them is followed")
         if n_hidden:
             notes.append(f"the animal is hidden in {n_hidden:,} frames")
-        if n_doubtful > _DOUBTFUL_SHARE * track.n_frames:
+        if n_doubtful > 0.05 * track.n_frames:
             notes.append(f"{n_doubtful} poses are doubtful")
         return Verdict(
             track.n_frames,

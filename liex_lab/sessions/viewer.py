@@ -29,7 +29,6 @@ from liex_lab.sessions.rrd_scene import DEPTH, MM_PER_UNIT, colour_range, dot_mm
 from liex_lab.sessions.session import Session
 from liex_lab.tracking.track import Track
 
-_PATIENCE_S = 30.0  # for a viewer to start
 Made = TypeVar("Made")
 
 
@@ -146,7 +145,8 @@ def _once_up(process: subprocess.Popen[bytes], attempt: Callable[[], Made], fail
     Raises:
         LiexError: the viewer ended, or did not start within 30 s.
     """
-    ends = time.monotonic() + _PATIENCE_S
+    # for a viewer to start
+    ends = time.monotonic() + 30.0
     why = "it ended at once"
     while time.monotonic() < ends and process.poll() is None:
         try:
@@ -194,7 +194,6 @@ def _end(viewer: subprocess.Popen[bytes]) -> None:
 
 
 ERROR = "error/predicted"
-_DEPTH_EVERY = 5  # frames; an image takes longer to send than a skeleton
 
 
 class LiveView:
@@ -259,7 +258,8 @@ class LiveView:
         self._stream.log(f"{SKELETON}/bones", rr.LineStrips3D(bones if posed else []))
         if posed:
             self._stream.log(ERROR, rr.Scalars(float(row.predicted_error_mm[0])))
-        if frame.index % _DEPTH_EVERY == 0:
+        # frames; an image takes longer to send than a skeleton
+        if frame.index % 5 == 0:
             depth = np.clip(np.rint(frame.depth), 0, 65535).astype(np.uint16)
             if not self._range:
                 self._range = colour_range(depth, self._floor_mm)

@@ -253,8 +253,7 @@ class Rows:
         stops = stop_times(time)
         for gap in self.camera_gaps:
             lost = bool(gap.n_frames_missing)
-            at_ns = gap.stop_ns if lost else gap.start_ns
-            row = int(np.searchsorted(self.track.times_ns, at_ns))
+            row = int(np.searchsorted(self.track.times_ns, (gap.stop_ns if lost else gap.start_ns)))
             if row < len(time):
                 begin = stops[row - 1] if lost and row else time[row]
                 span = (float(begin), float(time[row] if lost else stops[row]))
@@ -343,8 +342,7 @@ def gap_follows(time_s: Array) -> NDArray[np.bool_]:
         (n,) bool, True also at the last frame.
     """
     times_ns = _in_ns(time_s)
-    apart = frames_apart(times_ns, recorded_step(times_ns))
-    return np.append(apart > 1, True)[: len(time_s)]
+    return np.append(frames_apart(times_ns, recorded_step(times_ns)) > 1, True)[: len(time_s)]
 
 
 def stop_times(time_s: Array) -> Array:

@@ -413,7 +413,6 @@ _LATER = {
     "rotations": set(ROOT_COVARIANCES),
     "gaps": {"x_mm", "y_mm"},
 }
-_ROWS_PER_BYTE = 8  # more is impossible: each frame has a timestamp
 _FEW = 10_000
 _SPANS = {"bouts", "gaps", "flips"}
 # our types in Parquet, and their kinds in pandas
@@ -447,7 +446,8 @@ def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
     }
     if name in exact and n_rows != exact[name]:
         raise ValueError(f"it has {n_rows} rows where the session has {exact[name]}")
-    if n_rows > max(_FEW, _ROWS_PER_BYTE * (n_joints + 1) * path.stat().st_size):
+    # more is impossible: each frame has a timestamp
+    if n_rows > max(_FEW, 8 * (n_joints + 1) * path.stat().st_size):
         raise ValueError(f"it claims {n_rows} rows, which a file of its size does not hold")
     if name not in exact and n_rows > max(_FEW, 4 * n_frames):
         raise ValueError(f"it claims {n_rows} rows for {n_frames} frames")

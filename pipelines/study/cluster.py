@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 _FORGOTTEN_S = 8.0  # a nanny whose process is gone for so long does not start another one by itself
 WORKERS_EVERY_S = 5.0  # between two checks of this machine's workers
 _NONE_LEFT_S = 60.0  # give up after all worker processes of a study are gone for so long
-_CLOSING = ("closing", "closed", "closing_gracefully")
 
 
 @contextmanager
@@ -91,7 +90,7 @@ class KeptWorkers:
         self._gone_since = {nanny: self._gone_since.get(nanny, now) for nanny in gone}
         waited = {nanny: now - since for nanny, since in self._gone_since.items()}
         for nanny, seconds in waited.items():
-            if seconds >= _FORGOTTEN_S and nanny.status.name not in _CLOSING:
+            if seconds >= _FORGOTTEN_S and not nanny.status.name.startswith("clos"):
                 self._cluster.loop.add_callback(nanny.instantiate)
         if len(gone) < len(nannies) or min(waited.values(), default=_NONE_LEFT_S) < _NONE_LEFT_S:
             return ""

@@ -19,6 +19,7 @@ from liex_lab.errors import RecordingError, StudyError
 from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime.processes import Done, Work, WorkerPool
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.text_files import loose_json
 from liex_lab.sessions.folder import (
     describe_failure,
     read_failure,
@@ -28,7 +29,7 @@ from liex_lab.sessions.folder import (
 )
 from liex_lab.sessions.verdict import read_verdict
 
-from .sharing import LOOKING, LookAtSession, MeasuringStage, about, input_stamp, read_document
+from .sharing import LOOKING, LookAtSession, MeasuringStage, about, input_stamp
 from .status import SessionStatus, to_look_at
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
     failure = read_failure(session.folder)
     if failure and failure.get("run_id") == run_id:
         return _result(session, "failed", failure)
-    same = read_document(session.folder).get("run_id") == run_id
+    same = loose_json(session.folder / "session.json").get("run_id") == run_id
     return _result(session, "done") if same else None
 
 
@@ -130,7 +131,6 @@ def quarantine(session: PlannedSession, failure: dict[str, Any]) -> dict[str, An
 
 TOPIC = "liex-progress"
 DEATHS = 3  # deaths of workers that are tolerated before a session is blamed
-_REPORT_EVERY_S = 0.5
 
 # session, pieces done, pieces in total, current step
 Report = Callable[[str, int, int | None, str], None]
@@ -166,8 +166,9 @@ class Crew:
             finished: called with each result as it arrives.
         """
         shared = n_shared(len(todo), self._n_jobs or len(self.client.nthreads()))
+        run_id = f"{os.getpid()}-{time.monotonic_ns()}"
+        task = partial(measure_one, run=run, run_id=run_id)
         planned = [one.session for one in todo]
-        task = partial(_on_worker, run)
         return self._each(planned, task, "measuring", quarantine, report, finished, shared)
 
     def look_at(
@@ -189,14 +190,12 @@ class Crew:
         def unobserved(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
             return about(session) | {"failure": failure}
 
-        return self._each(
-            sessions, partial(_look_on_worker, look), LOOKING, unobserved, report, finished
-        )
+        return self._each(sessions, look, LOOKING, unobserved, report, finished)
 
     def _each(
         self,
         planned: Sequence[PlannedSession],
-        task: Callable[[PlannedSession, str, bool], dict[str, Any]],
+        task: Callable[..., dict[str, Any]],
         stage: str,
         died: Callable[[PlannedSession, dict[str, Any]], dict[str, Any]],
         report: Report,
@@ -207,11 +206,10 @@ class Crew:
         from distributed import CancelledError, as_completed
 
         self._report = report
-        run_id = f"{os.getpid()}-{time.monotonic_ns()}"
         alone = len(planned) - shared
-        sessions = {f"{session.id}-{run_id}": session for session in planned}
+        sessions = {f"{one.id}-{os.getpid()}-{time.monotonic_ns()}": one for one in planned}
         submitted = [
-            self.client.submit(task, session, run_id, k >= alone, key=key, pure=False)
+            self.client.submit(_on_worker, task, session, k >= alone, key=key, pure=False)
             for k, (key, session) in enumerate(sessions.items())
         ]
         completed = as_completed(submitted, loop=self.client.loop)
@@ -260,17 +258,10 @@ def _why_died(error: BaseException, stage: str) -> dict[str, Any]:
 
 
 def _on_worker(
-    run: RunSession, session: PlannedSession, run_id: str, shared: bool
+    task: Callable[..., dict[str, Any]], session: PlannedSession, shared: bool
 ) -> dict[str, Any]:
     """The task: measure one session and report to the client; `shared` uses all workers."""
-    return measure_one(session, run, _reporter(session), run_id, Workers() if shared else None)
-
-
-def _look_on_worker(
-    look: LookAtSession, session: PlannedSession, run_id: str, shared: bool
-) -> dict[str, Any]:
-    """The task: inspect one session, which is too short to share among workers."""
-    return look(session, _reporter(session))
+    return task(session, progress=_reporter(session), **({"pool": Workers()} if shared else {}))
 
 
 def _reporter(session: PlannedSession) -> Progress:
@@ -283,7 +274,7 @@ def _reporter(session: PlannedSession) -> Progress:
     def send(done: int, total: int | None, what: str) -> None:
         nonlocal last
         now = time.monotonic()
-        if now - last > _REPORT_EVERY_S:
+        if now - last > 0.5:
             last = now
             worker.log_event(TOPIC, [session.id, done, total, what])
 

@@ -30,11 +30,9 @@ from liex_lab.runtime.progress import Progress, silent
 
 _FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".mkv", ".avi")
 _DEPTHS = ("depth.dat", "depth.avi", "depth.mkv")  # each marks its folder as a recording
-_NOTES = ("camera.toml", "raytrix.toml")  # these, too, if the folder has no files of depth
 _COMPARED_BYTES = 1 << 20  # compared at the beginning and the end of files of the same size
 _MOST_LISTED = 4  # sessions of an animal
 Named = tuple[str, str, Path, str]  # animal, session, recording, origin of the animal's name
-_SKIPPED = {"derivatives", "thumbnails"}
 _HEADER = """\
 # A study of liex_lab: which animals, in which groups, recorded in which sessions. Correct what is wrong here, then
 #     liex cohort {file} --dry-run      says what will be done, and why
@@ -172,7 +170,8 @@ def find_recordings(folder: Path) -> list[Path]:
     for inside, folders, names in os.walk(folder):
         here = Path(inside)
         files = [name for name in sorted(names) if name.lower().endswith(_FILES)]
-        noted = not set(names).isdisjoint(_NOTES) and not files
+        # these, too, if the folder has no files of depth
+        noted = not set(names).isdisjoint(("camera.toml", "raytrix.toml")) and not files
         one_recording = here != folder and (noted or not set(names).isdisjoint(_DEPTHS))
         found += [here] if one_recording else [here / name for name in files if name[0] != "."]
         folders[:] = sorted(
@@ -180,7 +179,7 @@ def find_recordings(folder: Path) -> list[Path]:
             for name in folders
             if not one_recording
             and name[0] != "."
-            and name not in _SKIPPED
+            and name not in {"derivatives", "thumbnails"}
             and not name.endswith((".liex", ".part"))
             and not (here / name / "session.json").exists()
         )

@@ -28,7 +28,7 @@ from ..compare import find_sessions
 from ..compiling import compile_ahead
 from .cluster import SlurmTable, crew_of, is_encrypted
 from .crew import Crew, RunSession
-from .sharing import LookAtSession, look_at, read_document, to_be_looked_at, write_look
+from .sharing import LookAtSession, look_at, to_be_looked_at, write_look
 from .status import SessionStatus, standings, to_look_at
 
 
@@ -128,7 +128,9 @@ def study_rows(study: Study, standings: Sequence[SessionStatus]) -> list[dict[st
     rows = []
     for one in standings:
         session, failure = one.session, one.failure or {}
-        document = read_document(session.folder) if one.state == "done" else {}
+        document = (
+            text_files.loose_json(session.folder / "session.json") if one.state == "done" else {}
+        )
         counted = document.get("frames")
         frames = counted if isinstance(counted, dict) else {}
         row = {
@@ -175,10 +177,6 @@ def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) else float("nan")
 
 
-# writes descriptions into a session, with their author: `liex_lab.api.correct_session`
-DescribeSession = Callable[..., Path]
-
-
 def run_study(
     study: Study,
     run: RunSession,
@@ -191,7 +189,8 @@ def run_study(
     only: Sequence[str],
     dry_run: bool,
     board: Callable[[int], AbstractContextManager[Board]],
-    describe: DescribeSession,
+    # writes descriptions into a session, with their author: `liex_lab.api.correct_session`
+    describe: Callable[..., Path],
     look: LookAtSession = look_at,
 ) -> list[SessionStatus]:
     """Measure the pending sessions of a study; returns every session's status.
@@ -284,17 +283,18 @@ def _look(
     with board(len(sessions)) as shown:
 
         def finished(found: dict[str, Any]) -> None:
-            """Store the findings on a session, and report them to the board."""
-            id, failure = found["session_id"], found.get("failure")
-            write_look(known[id], found)
-            sentence = (
-                f"could not be looked at: {failure['reason']}"
-                if failure
-                else f"shows an animal of {found['animal']['spine_mm']:.1f} mm"
-            )
-            shown.ended(id, sentence, failed=failure is not None)
+            write_look(known[found["session_id"]], found)
+            failure = found.get("failure")
+            done = failure or f"shows an animal of {found['animal']['spine_mm']:.1f} mm"
+            _ended(shown, found["session_id"], "could not be looked at", done)
 
         crew.look_at(sessions, look, shown.told, finished)
+
+
+def _ended(shown: Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
+    """Show that the work on a session ended: a sentence, or the failure that ended it."""
+    sentence = done if isinstance(done, str) else f"{failed}: {done['reason']}"
+    shown.ended(id, sentence, failed=not isinstance(done, str))
 
 
 def _measure(
@@ -307,15 +307,10 @@ def _measure(
 
         def finished(result: dict[str, Any]) -> None:
             """Report the `result` of a session to the board."""
-            failure = result["failure"]
             copy = result.get("corrections_taken_from")
             taken = f", with the corrections of {copy}" if copy else ""
             look = f"; {why}" if (why := result.get("look_at_it")) else ""
-            sentence = (
-                f"failed: {failure['reason']}"
-                if failure
-                else f"is done, in {result['seconds']:.0f} s{taken}{look}"
-            )
-            shown.ended(result["id"], sentence, failed=failure is not None)
+            done = f"is done, in {result['seconds']:.0f} s{taken}{look}"
+            _ended(shown, result["id"], "failed", result["failure"] or done)
 
         crew.measure(todo, run, shown.told, finished)

@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from stat import S_ISDIR
 from typing import Any
 
 import numpy as np
@@ -39,22 +38,9 @@ from ..build import animal_facts, build_estimator, build_recording, open_planned
 from ..choice import fit_plan
 from ..session import MEASURING
 
-LOOK_FILE = "look.json"
 LOOKING = "looking at the animal"
-_MM_DECIMALS = 3
 _DECIMALS = 4  # of a shape, relative to the length or to the average animal
 LookAtSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
-# files with metadata next to a recording
-_SAYS = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}
-
-
-def read_document(folder: Path) -> dict[str, Any]:
-    """The session.json of a folder; {} if it is absent or cannot be read."""
-    try:
-        found = json.loads((folder / "session.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:
@@ -137,14 +123,13 @@ def input_stamp(recording: str) -> str:
         return ""
     whole = path.is_dir()
     folder = path if whole else path.parent
+    notes = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}  # metadata next to a recording
     entries = []
     for file in folder.rglob("*") if whole else folder.iterdir():
-        if whole or file == path or file.suffix.lower() in _SAYS:
+        if (whole or file == path or file.suffix.lower() in notes) and not file.is_dir():
             with suppress(OSError):  # it has just been removed
                 found = file.stat()
-                if not S_ISDIR(found.st_mode):
-                    name = str(file.relative_to(folder))
-                    entries.append([name, found.st_size, found.st_mtime_ns])
+                entries.append([str(file.relative_to(folder)), found.st_size, found.st_mtime_ns])
     return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
 
 
@@ -203,15 +188,13 @@ def to_be_looked_at(
         retry: inspect failed ones again.
         again: inspect all again.
     """
-    found = []
-    for group in _groups(study):
-        if only and not any(session.id in only for session in group):
-            continue
-        for session in group:
-            look = None if again else read_look(session)
-            if look is None or (retry and "failure" in look):
-                found.append(session)
-    return found
+
+    def is_pending(session: PlannedSession) -> bool:
+        look = None if again else read_look(session)
+        return look is None or (retry and "failure" in look)
+
+    groups = [g for g in _groups(study) if not only or any(one.id in only for one in g)]
+    return [session for group in groups for session in group if is_pending(session)]
 
 
 def _groups(study: Study) -> list[list[PlannedSession]]:
@@ -249,7 +232,7 @@ def together(
     body = SharedBody(
         subject=subject,
         n_sessions=len(found),
-        spine_mm=None if agreed.spine_mm is None else round(agreed.spine_mm, _MM_DECIMALS),
+        spine_mm=None if agreed.spine_mm is None else round(agreed.spine_mm, 3),
         girth=None if agreed.girth is None else round(agreed.girth, _DECIMALS),
         shape=None if agreed.shape is None else _shape(agreed.shape),
     )
@@ -375,7 +358,7 @@ def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
 
 def look_file(session: PlannedSession) -> Path:
     """The path of a session's look.json, next to its results."""
-    return session.folder.with_name(LOOK_FILE)
+    return session.folder.with_name("look.json")
 
 
 def write_look(session: PlannedSession, look: dict[str, Any]) -> None:

@@ -116,8 +116,7 @@ def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
         return _measured(session, file)
     failure = read_failure(session.folder)
     if failure is not None:
-        unsure = "input" not in failure or waits_for
-        why = "" if unsure else what_changed(session, failure)
+        why = "" if ("input" not in failure or waits_for) else what_changed(session, failure)
         reason = f"{why}; before, it failed: {failure['reason']}" if why else str(failure["reason"])
         return SessionStatus(session, "changed" if why else "failed", reason, failure)
     if session.folder.with_name(f"{session.folder.name}.part").is_dir():
