@@ -124,3 +124,15 @@ def one_line(error: BaseException) -> str:
     At most 200 characters; the type's name replaces an empty message.
     """
     return str(error).strip().partition("\n")[0][:200] or type(error).__name__
+
+
+def refuse(kind: type[Exception], *checks: tuple[object, str]) -> None:
+    """Raise the first error of a list of checks.
+
+    Args:
+        kind: class of the error.
+        checks: whether there is an error, and its sentence.
+    """
+    for is_wrong, sentence in checks:
+        if is_wrong:
+            raise kind(sentence)

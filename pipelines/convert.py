@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingError
+from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingError, refuse
 from liex_lab.optics.camera import Lens
 from liex_lab.plan import Plan
 from liex_lab.recordings import Recording, camera_file, open_recording
@@ -172,20 +172,25 @@ def _check_target(target: Path, overwrite: bool) -> None:
     """Refuse other kinds of targets, folders with other files, and existing ones unless
     `overwrite`.
     """
-    if _OTHER_KINDS.search(target.name):
-        raise RecordingError(
+    is_file = _is_mcap(target)
+    refuse(
+        RecordingError,
+        (
+            _OTHER_KINDS.search(target.name),
             f"{target.name} is no name of what can be written; give NAME.mcap, or a folder's "
-            "name for PNG images"
-        )
-    if not target.parent.is_dir():
-        raise RecordingError(
-            f"there is no folder {target.parent} to write {target.name} into; make it first"
-        )
+            "name for PNG images",
+        ),
+        (
+            not target.parent.is_dir(),
+            f"there is no folder {target.parent} to write {target.name} into; make it first",
+        ),
+        (
+            target.exists() and target.is_dir() == is_file,
+            f"{target} is a {'folder' if is_file else 'file'}; give another name",
+        ),
+    )
     if not target.exists():
         return
-    is_file = _is_mcap(target)
-    if target.is_dir() if is_file else not target.is_dir():
-        raise RecordingError(f"{target} is a {'folder' if is_file else 'file'}; give another name")
     own = {camera_file.CAMERA_FILE, STAMPS}
     others = [
         path.name
@@ -348,13 +353,18 @@ def _target(
 ) -> Path:
     """Path of the archive."""
     beside = Path(recording).parent if opened.sources else Path()
-    target = Path(to) if to is not None else durable.inside(beside, opened.name, f"{SUFFIX}.mcap")
-    if target.suffix.lower() != ".mcap":
-        raise RecordingError(
-            f"an archive is an MCAP file; give --to NAME.mcap (in Python to=), not {target.name}"
-        )
-    if any(target.resolve() == source.resolve() for source in opened.sources):
-        raise RecordingError(f"{target} is the recording itself; write under another name")
+    target = Path(to) if to is not None else places.inside(beside, opened.name, f"{SUFFIX}.mcap")
+    refuse(
+        RecordingError,
+        (
+            not _is_mcap(target),
+            f"an archive is an MCAP file; give --to NAME.mcap (in Python to=), not {target.name}",
+        ),
+        (
+            any(target.resolve() == source.resolve() for source in opened.sources),
+            f"{target} is the recording itself; write under another name",
+        ),
+    )
     _check_target(target, overwrite)
     return target
 

@@ -8,7 +8,7 @@ from liex_lab.dashboards.figures import sets
 from liex_lab.dashboards.report.report import write_report
 from liex_lab.dashboards.video.video import write_clips, write_session
 
-from liex_lab.errors import SessionError
+from liex_lab.errors import SessionError, refuse
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import stretch, video_path
@@ -116,10 +116,14 @@ def export_video(
         there = ", ".join(sorted({group for _, group in named} - {""})) or "none"
         raise SessionError(f"no session is of {' or '.join(groups)}; their groups are {there}")
     part = start_s is not None or stop_s is not None
-    if part and (len(chosen) > 1 or actions):
-        raise SessionError("a stretch of time is shown of one session, without actions")
-    if not slower > 0:
-        raise SessionError(f"slower is a number above 0, such as 4, got {slower:g}")
+    refuse(
+        SessionError,
+        (
+            part and (len(chosen) > 1 or actions),
+            "a stretch of time is shown of one session, without actions",
+        ),
+        (not slower > 0, f"slower is a number above 0, such as 4, got {slower:g}"),
+    )
     alone = chosen[0][0]
     folder = Path(out) if out is not None else alone.path if len(chosen) == 1 else Path()
     what = stretch(start_s, stop_s) if part else "+".join(actions)

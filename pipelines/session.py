@@ -498,7 +498,7 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
         SessionError: there is not enough disk space.
     """
     build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
-    checkpoint.hash_once(fitted.recording, part_folder(folder), progress)
+
     origin = build_provenance(fitted.recording, fitted.plan, fitted.tracker, progress)
     needed = session_bytes(
         fitted.recording, fitted.plan, fitted.tracker.spine_mm, origin.floor_distance_mm

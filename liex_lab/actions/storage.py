@@ -15,7 +15,7 @@ import numpy as np
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.actions.timeline import SemiMarkovModel, TimelineModel
 from liex_lab.catalog import MODELS, find_file, sha256
-from liex_lab.errors import ModelError
+from liex_lab.errors import ModelError, refuse
 from liex_lab.mlp import Network, check_layers
 from liex_lab.runtime.durable import replacing
 
@@ -202,11 +202,23 @@ def check_timeline(model: TimelineModel) -> None:
         ValueError: the mismatch, as a part of a sentence.
     """
     k = len(model.words)
-    if k < 2 or len(set(model.words)) != k or UNLABELLED not in model.words:
-        raise ValueError("its words are not two or more, each named once, one for what has no name")
-    if not all(isinstance(word, str) for word in (*model.words, model.skeleton)):
-        raise ValueError("its words are not all words")
     chain = model.chain
+    refuse(
+        ValueError,
+        (
+            k < 2 or len(set(model.words)) != k or UNLABELLED not in model.words,
+            "its words are not two or more, each named once, one for what has no name",
+        ),
+        (
+            not all(isinstance(word, str) for word in (*model.words, model.skeleton)),
+            "its words are not all words",
+        ),
+        (not model.networks, "it holds no network"),
+        (
+            not 0.0 < model.clock_hz <= _FASTEST_HZ or not np.isfinite(model.sharpness),
+            f"its clock should tick up to {_FASTEST_HZ:.0f} times a second",
+        ),
+    )
     for name, values, shape in (
         ("share", model.share, (k,)),
         ("speeds", model.speeds, (k, 2)),
@@ -220,10 +232,6 @@ def check_timeline(model: TimelineModel) -> None:
     durations = np.concatenate([chain.shortest_s, chain.mean_s])
     if not ((durations >= 0) & (durations <= _LONGEST_S)).all():
         raise ValueError(f"its actions should last between 0 and {_LONGEST_S:.0f} s")
-    if not 0.0 < model.clock_hz <= _FASTEST_HZ or not np.isfinite(model.sharpness):
-        raise ValueError(f"its clock should tick up to {_FASTEST_HZ:.0f} times a second")
-    if not model.networks:
-        raise ValueError("it holds no network")
     for network in model.networks:
         check_layers(network, k)
 

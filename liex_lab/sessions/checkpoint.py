@@ -24,21 +24,18 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt
 
 from liex_lab.errors import SessionError
 from liex_lab.recordings.formats.messages.mcap import MAGIC, RECORD
-from liex_lab.recordings.recording import Recording
-from liex_lab.runtime import durable, memory, text_files
-from liex_lab.runtime.progress import Progress
+from liex_lab.runtime import durable, memory, places, text_files
 
 # between two checkpoints: the most work that can be lost, besides startup
 EVERY_S = 3.0
 _STATE = "checkpoint.json"
 _LOCK = "lock"
 _SEEN = "seen"
-_INPUT = "input.json"
 STRETCHES = "stretches"
 # of work: 300 years; also excludes integers too large for a float
 _MOST_S = 1e10
 _MOST = 1 << 20  # values per frame in one column
-OWN = (_STATE, _LOCK, _SEEN, _INPUT, STRETCHES, "resumed.rrd")  # not in the finished session
+OWN = (_STATE, _LOCK, _SEEN, STRETCHES, "resumed.rrd")  # not in the finished session
 
 
 LOGS = ("session.rrd", "session.mcap")
@@ -217,7 +214,7 @@ class Checkpoint:
 
     def _empty(self) -> None:
         for path in self.folder.iterdir():
-            if path.name not in (_LOCK, _INPUT):
+            if path.name != _LOCK:
                 _remove(path)
 
 
@@ -378,28 +375,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def hash_once(recording: Recording, folder: Path, progress: Progress) -> None:
-    """Compute the recording's SHA-256, or reuse it from an interrupted run of the same files.
-
-    Hashing a long recording takes time. A hash that took longer than `EVERY_S` is stored in
-    input.json, and is valid while names, sizes and modification times of the files are the same.
-
-    Args:
-        recording: the recording, which then has its hash.
-        folder: the folder of the unfinished session.
-        progress: reports how many MB were read.
-    """
-    stamp = recording.files.stamp
-    known = text_files.loose_json(folder / _INPUT)
-    if stamp and known.get("stamp") == stamp and isinstance(known.get("sha256"), str):
-        recording.files.known_digest = known["sha256"]
-    began = time.monotonic()
-    digest = recording.digest(progress)
-    if stamp and time.monotonic() - began > EVERY_S:
-        durable.unlinked(folder).mkdir(parents=True, exist_ok=True)
-        durable.write_whole(folder / _INPUT, json.dumps({"stamp": stamp, "sha256": digest}))
 
 
 def check_free(folder: Path) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import Ethogram
 from liex_lab.actions.labels import sessions_named, words_of
-from liex_lab.errors import LiexError, SessionError
+from liex_lab.errors import LiexError, SessionError, refuse
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions.corrections import (
@@ -111,15 +111,19 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
             joints with a head and a tail.
     """
     first, last = rows_between(session, start_s, stop_s, "a span to flip")
-    if any(b - a != 1 for a, b in session.metadata["animal"]["bones"]):
-        raise SessionError(
+    refuse(
+        SessionError,
+        (
+            any(b - a != 1 for a, b in session.metadata["animal"]["bones"]),
             f"head and tail cannot be exchanged in a {session.metadata['animal']['name']}: its "
-            "joints branch; move single joints with `liex correct joint`"
-        )
-    if not np.isfinite(_ahead(session)[first:last]).all(axis=1).any():
-        raise SessionError(
-            f"no frame from {start_s:g} to {stop_s:g} s has a pose, so there is nothing to exchange"
-        )
+            "joints branch; move single joints with `liex correct joint`",
+        ),
+        (
+            not np.isfinite(_ahead(session)[first:last]).all(axis=1).any(),
+            f"no frame from {start_s:g} to {stop_s:g} s has a pose, so there is nothing to "
+            "exchange",
+        ),
+    )
     count = frame_count(session.frames["frame_index"].to_numpy(np.int64))
     return FlipSpan(int(count[first]), int(count[last]))
 
@@ -212,19 +216,22 @@ def joint_move(
         raise SessionError(
             f"a joint's place is x, y and z in mm of the arena frame, got {place_mm}"
         )
-    if place[2] < min(0.0, was[2]) - 1e-6:
-        raise SessionError(
-            f"{joint} of frame {frame} cannot be {-place[2]:.1f} mm below the floor; give a height "
-            f"z of 0 mm or more (it is at {was[2]:.1f} mm now)"
-        )
     length = float(session.frames["spine_mm"].iloc[row])
     distance = float(np.linalg.norm(place - was))
-    if distance > length:
-        raise SessionError(
+    refuse(
+        SessionError,
+        (
+            place[2] < min(0.0, was[2]) - 1e-6,
+            f"{joint} of frame {frame} cannot be {-place[2]:.1f} mm below the floor; give a height "
+            f"z of 0 mm or more (it is at {was[2]:.1f} mm now)",
+        ),
+        (
+            distance > length,
             f"{joint} of frame {frame} cannot be {distance:.0f} mm from where it was found, at "
             f"({was[0]:.1f}, {was[1]:.1f}, {was[2]:.1f}) mm, for the animal is {length:.0f} mm "
-            "long; check the place"
-        )
+            "long; check the place",
+        ),
+    )
     x, y, z = (round(float(one), 3) for one in place)
     return JointMove(int(frame), joint, x, y, z, note)
 

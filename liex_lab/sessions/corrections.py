@@ -22,8 +22,8 @@ from pydantic import Field, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from liex_lab.catalog import sha256
-from liex_lab.errors import SessionError, one_line
-from liex_lab.runtime.durable import safe_name
+from liex_lab.errors import SessionError, one_line, refuse
+from liex_lab.runtime.places import safe_name
 from liex_lab.sessions.verdict import ALSO, WHO
 
 FOLDER = "corrected"
@@ -224,10 +224,12 @@ class Log:
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if any(safe_name(name) != name for name in self.files):
-            raise ValueError("files outside of its folder")
-        if not set(self.facts) <= FACTS:
-            raise ValueError(f"facts of {', '.join(sorted(set(self.facts) - FACTS))}")
+        others = sorted(set(self.facts) - FACTS)
+        refuse(
+            ValueError,
+            (any(safe_name(name) != name for name in self.files), "files outside of its folder"),
+            (others, f"facts of {', '.join(others)}"),
+        )
 
     @property
     def standing(self) -> tuple[LogEntry, ...]:

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from liex_lab.catalog import sha256
-from liex_lab.errors import LiexError, SessionError
-from liex_lab.runtime import durable, memory, text_files
+from liex_lab.errors import LiexError, SessionError, refuse
+from liex_lab.runtime import durable, memory, places, text_files
 from liex_lab.sessions.checkpoint import OWN, hold
 from liex_lab.sessions.corrections import FOLDER, LOG, corrected_folder, read_log
 from liex_lab.sessions.provenance import versions
@@ -150,16 +150,19 @@ def check_writable(path: Path, overwrite: bool) -> None:
         path.is_dir() and {entry.name for entry in path.iterdir()} <= {FAILED_FILE}
     ):
         return  # a failed session may be replaced
-    if not (path / "session.json").is_file():
-        raise SessionError(
+    refuse(
+        SessionError,
+        (
+            not (path / "session.json").is_file(),
             f"{path} exists and is not a session, so it is left alone; choose another place "
-            "(--out, in Python out=)"
-        )
-    if not overwrite:
-        raise SessionError(
+            "(--out, in Python out=)",
+        ),
+        (
+            not overwrite,
             f"the session {path} exists already; choose another place (--out, in Python out=), or "
-            "say --overwrite (in Python overwrite=True)"
-        )
+            "say --overwrite (in Python overwrite=True)",
+        ),
+    )
 
 
 def file_facts(folder: Path) -> dict[str, Any]:

@@ -21,10 +21,10 @@ from typing import Annotated, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import LiexError, SessionError, one_line
+from liex_lab.errors import LiexError, SessionError, one_line, refuse
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
@@ -252,22 +252,9 @@ THUMBNAILS = "thumbnails"  # folder of a session
 _MOST_BYTES = 1 << 28
 _MOST_FRAMES = 1 << 31
 _MOST_PX = 1 << 15
-_ESCAPED = re.compile(r"\\u(0000|[dD][89a-fA-F])")
 
 
-def _storable(text: str) -> str:
-    """Check that files can store a text: Unicode without NUL or surrogates."""
-    if "\0" in text:
-        raise ValueError("holds a NUL character")
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise ValueError("holds half of a Unicode character") from None
-    return text
-
-
-Text = Annotated[str, AfterValidator(_storable)]
-Name = Annotated[Text, Field(max_length=4096)]
+Name = Annotated[str, Field(max_length=4096)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=0, le=_MOST_FRAMES)]
 Focal = Annotated[float, Field(gt=1e-3, lt=1e7)]
@@ -280,10 +267,10 @@ class _Section(BaseModel):
 
 class _Input(_Section):
     name: Name
-    format: Text
-    sha256: Text
+    format: str
+    sha256: str
     truncated: bool
-    profile: dict[Text, Any] = {}
+    profile: dict[str, Any] = {}
 
 
 class _Camera(_Section):
@@ -293,10 +280,10 @@ class _Camera(_Section):
     cy: Finite
     width: Size
     height: Size
-    source: Text
+    source: str
     T_arena_camera: list[list[Finite]]
     floor_distance_mm: Finite
-    optics: dict[Text, Any] | None = None
+    optics: dict[str, Any] | None = None
 
 
 class _Shape(_Section):
@@ -304,8 +291,8 @@ class _Shape(_Section):
     n_frames: Count
     average_residual_mm: Finite | None = None
     residual_mm: Finite | None = None
-    why: Text = ""
-    shared_by: Text = ""
+    why: str = ""
+    shared_by: str = ""
     places: list[Finite] = []
     width: list[Factor] = []
     width_sd: list[Finite] = []
@@ -316,11 +303,18 @@ class _Shape(_Section):
     @model_validator(mode="after")
     def _fit(self) -> _Shape:
         columns = (self.width, self.width_sd, self.height, self.height_sd)
-        if any(len(column) != len(self.places) for column in columns):
-            raise ValueError(f"has not as many widths and heights as its {len(self.places)} places")
         known = self.residual_mm is not None and self.average_residual_mm is not None
-        if self.kept and not ((known or self.shared_by) and self.places and self.joints_moved):
-            raise ValueError("is kept, but its residuals or its places are missing")
+        refuse(
+            ValueError,
+            (
+                any(len(column) != len(self.places) for column in columns),
+                f"has not as many widths and heights as its {len(self.places)} places",
+            ),
+            (
+                self.kept and not ((known or self.shared_by) and self.places and self.joints_moved),
+                "is kept, but its residuals or its places are missing",
+            ),
+        )
         return self
 
 
@@ -330,27 +324,30 @@ class _Animal(_Section):
     bones: list[Annotated[list[int], Field(min_length=2, max_length=2)]]
     home_length_mm: Finite
     spine_mm: Finite | None = None
-    origin: Text | None = None
+    origin: str | None = None
     shape: _Shape | None = None
 
     @model_validator(mode="after")
     def _fit(self) -> _Animal:
-        if len(set(self.joints)) != len(self.joints):
-            raise ValueError("names a joint twice")
-        if any(not 0 <= joint < len(self.joints) for bone in self.bones for joint in bone):
-            raise ValueError(
-                f"has a bone between joints that do not exist, it has {len(self.joints)}"
-            )
+        n = len(self.joints)
+        refuse(
+            ValueError,
+            (len(set(self.joints)) != n, "names a joint twice"),
+            (
+                any(not 0 <= joint < n for bone in self.bones for joint in bone),
+                f"has a bone between joints that do not exist, it has {n}",
+            ),
+        )
         return self
 
 
 class _Model(_Section):
-    name: Text = ""
-    sha256: Text = ""
+    name: str = ""
+    sha256: str = ""
 
 
 class _Thumbnail(_Section):
-    file: Text
+    file: str
     frame_index: int
     left_px: int
     top_px: int
@@ -371,7 +368,7 @@ class _WholeImage(_Thumbnail):
 class _FrameCounts(_Section):
     n_frames: Count
     n_observed: Count
-    flags: dict[Text, Count]
+    flags: dict[str, Count]
     n_missing: Annotated[int, Field(ge=0)]
     n_gaps: Count
     duration_s: Finite
@@ -380,11 +377,11 @@ class _FrameCounts(_Section):
 
 
 class _Refusal(_Section):
-    action: Text
+    action: str
     start_s: Finite
     stop_s: Finite
-    named: Text | None
-    why: Text
+    named: str | None
+    why: str
 
 
 class _Refusals(_Section):
@@ -392,28 +389,28 @@ class _Refusals(_Section):
 
 
 class _Recogniser(_Section):
-    sha256: Text = ""
-    labels: Text = ""
+    sha256: str = ""
+    labels: str = ""
     n_recordings: Count = 0
     clock_hz: Finite | None = None
 
 
 class _HandMade(_Section):
     n: Count = 0
-    authors: list[Text] = []
+    authors: list[str] = []
 
 
 class _Verdict(_Section):
     look_at_it: bool = False
     accepted: bool = False
-    reasons: list[Text] = []
-    cautions: list[Text] = []
-    sentence: Text = ""
+    reasons: list[str] = []
+    cautions: list[str] = []
+    sentence: str = ""
 
 
 class _Facts(_Section):
     bytes: Annotated[int, Field(ge=0)]
-    sha256: Text = ""
+    sha256: str = ""
 
 
 class Document(_Section):
@@ -422,31 +419,31 @@ class Document(_Section):
     schema_version: Annotated[int, Field(ge=1)]
     session_id: Name
     individual: Name
-    subject: dict[Text, Text]
-    session_start_time: Text | None
-    versions: dict[Text, Text | None]
+    subject: dict[str, str]
+    session_start_time: str | None
+    versions: dict[str, str | None]
     input: _Input
-    plan: dict[Text, Any]
+    plan: dict[str, Any]
     camera: _Camera
-    arena: dict[Text, Any] | None = None
-    zones: list[dict[Text, Any]] = []
+    arena: dict[str, Any] | None = None
+    zones: list[dict[str, Any]] = []
     animal: _Animal
     model: _Model
-    problems: list[Text]
-    actions: dict[Text, Text] = {}
-    rules: dict[Text, Finite] | None = None
-    no_actions: Text = ""
+    problems: list[str]
+    actions: dict[str, str] = {}
+    rules: dict[str, Finite] | None = None
+    no_actions: str = ""
     thumbnails: list[_Thumbnail] = []
     whole_picture: _WholeImage | None = None
-    files: dict[Text, _Facts] = {}
+    files: dict[str, _Facts] = {}
     frames: _FrameCounts
     depth_unit_mm: Finite = 1.0
-    timings_s: dict[Text, Finite]
+    timings_s: dict[str, Finite]
     frames_per_s: Finite
     peak_memory_mb: Finite | None = None
     interruptions: Count = 0
     action_model: _Recogniser | None = None
-    unresolved_actions: dict[Text, Text] | None = None
+    unresolved_actions: dict[str, str] | None = None
     refused_bouts: _Refusals | None = None
     corrections: _HandMade | None = None
     verdict: _Verdict | None = None
@@ -483,8 +480,10 @@ def read_document(path: Path) -> dict[str, Any]:
         Arena.from_dict(found.get("arena") or {"kind": "open"})
         for zone in found.get("zones", []):
             Zone.from_dict(zone)
-        if _ESCAPED.search(text):
-            _walk(found)
+        if "\\u" in text:
+            json.dumps(found, ensure_ascii=False).encode()  # fails for half of a character
+            nul = re.search(r"(?<!\\)(?:\\\\)*\\u0000", text)
+            refuse(ValueError, (nul, "it holds a NUL character"))
     except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
         why = _first(error) if isinstance(error, ValidationError) else str(error)
         raise SessionError(
@@ -492,19 +491,6 @@ def read_document(path: Path) -> dict[str, Any]:
             "`liex run` on the recording again"
         ) from None
     return found
-
-
-def _walk(value: Any) -> None:
-    """Raises ValueError if any nested text contains what files cannot store."""
-    if isinstance(value, str):
-        _storable(value)
-    elif isinstance(value, dict):
-        for key, inner in value.items():
-            _storable(key)
-            _walk(inner)
-    elif isinstance(value, list):
-        for inner in value:
-            _walk(inner)
 
 
 def _no_number(text: str) -> NoReturn:

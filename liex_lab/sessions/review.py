@@ -23,8 +23,8 @@ from pydantic import TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from liex_lab.actions.labels import RaterAgreement, cohens_kappa
-from liex_lab.errors import SessionError, one_line
-from liex_lab.runtime import durable
+from liex_lab.errors import SessionError, one_line, refuse
+from liex_lab.runtime import durable, places
 from liex_lab.sessions.corrections import UNREADABLE
 from liex_lab.sessions.session import Session
 
@@ -98,14 +98,18 @@ class Review:
             SessionError: the name, the clip or the word is invalid.
         """
         rater = checked_name(rater, "a rater")
-        if rater == PROGRAM:
-            raise SessionError(f"'{PROGRAM}' rates already; take another name")
-        if not 0 <= clip < len(self.clips):
-            raise SessionError(f"there is no clip {clip}; the review has {len(self.clips)}")
-        if word not in (*self.words, NO_NAME):
-            raise SessionError(
-                f"the review has no word '{word}'; known are {', '.join(self.words)}"
-            )
+        refuse(
+            SessionError,
+            (rater == PROGRAM, f"'{PROGRAM}' rates already; take another name"),
+            (
+                not 0 <= clip < len(self.clips),
+                f"there is no clip {clip}; the review has {len(self.clips)}",
+            ),
+            (
+                word not in (*self.words, NO_NAME),
+                f"the review has no word '{word}'; known are {', '.join(self.words)}",
+            ),
+        )
         own = {**self.answers.get(rater, {}), clip: word}
         return replace(self, answers={**self.answers, rater: own})
 

@@ -66,6 +66,16 @@ FILES = {  # of a session, and whether every version writes it
 PULSE = next(column for column in FRAMES if column.name == "pulse_index")
 
 
+def _table(name: str, what: str) -> cached_property[pd.DataFrame]:
+    """A table of a session as a property, read when it is first used."""
+
+    def read(session: Session) -> pd.DataFrame:
+        return session.table(name)
+
+    read.__doc__ = what
+    return cached_property(read)
+
+
 class Session:
     """The results of one recording, read from its folder on demand.
 
@@ -166,62 +176,56 @@ class Session:
         """
         return self.file(name).is_file()
 
-    @cached_property
-    def frames(self) -> pd.DataFrame:
-        """Table `frames`, one row per recorded frame: time, gap, predicted error, flag."""
-        return self.table("frames")
+    frames = _table(
+        "frames", "Table `frames`, one row per recorded frame: time, gap, predicted error, flag."
+    )
 
-    @cached_property
-    def poses(self) -> pd.DataFrame:
-        """Table `poses`, one row per recorded frame and joint: position (mm), pixel, sd (mm)."""
-        return self.table("poses")
+    poses = _table(
+        "poses",
+        "Table `poses`, one row per recorded frame and joint: position (mm), pixel, sd (mm).",
+    )
 
-    @cached_property
-    def rotations(self) -> pd.DataFrame:
+    rotations = _table(
+        "rotations",
         """Table `rotations`, one row per recorded frame and joint, and one for the root.
 
-        The root's row is its rigid transform and includes a translation. Rotations are rotation
-        vectors, rad; translations mm.
-        """
-        return self.table("rotations")
+    The root's row is its rigid transform and includes a translation. Rotations are rotation
+    vectors, rad; translations mm.
+    """,
+    )
 
-    @cached_property
-    def kinematics(self) -> pd.DataFrame:
-        """Table `kinematics`, one row per recorded frame: speed (mm/s), heading, heights (mm)."""
-        return self.table("kinematics")
+    kinematics = _table(
+        "kinematics",
+        "Table `kinematics`, one row per recorded frame: speed (mm/s), heading, heights (mm).",
+    )
 
-    @cached_property
-    def bouts(self) -> pd.DataFrame:
-        """The ethogram: table `bouts`, one row per bout."""
-        return self.table("bouts")
+    bouts = _table("bouts", "The ethogram: table `bouts`, one row per bout.")
 
-    @cached_property
-    def gaps(self) -> pd.DataFrame:
-        """Table `gaps`, one row per interval of frames that are missing or without a pose."""
-        return self.table("gaps")
+    gaps = _table(
+        "gaps", "Table `gaps`, one row per interval of frames that are missing or without a pose."
+    )
 
-    @cached_property
-    def flips(self) -> pd.DataFrame:
-        """Table `flips`, one row per interval in which head and tail may be exchanged."""
-        return self.table("flips")
+    flips = _table(
+        "flips", "Table `flips`, one row per interval in which head and tail may be exchanged."
+    )
 
-    @cached_property
-    def transitions(self) -> pd.DataFrame:
-        """Table `transitions`, one row per pair of actions: how often one followed the other."""
-        return self.table("transitions")
+    transitions = _table(
+        "transitions",
+        "Table `transitions`, one row per pair of actions: how often one followed the other.",
+    )
 
-    @cached_property
-    def activity(self) -> pd.DataFrame:
-        """Table `activity`, one row per time bin: distance (mm) and share of each action."""
-        return self.table("activity")
+    activity = _table(
+        "activity",
+        "Table `activity`, one row per time bin: distance (mm) and share of each action.",
+    )
 
-    @cached_property
-    def zone_visits(self) -> pd.DataFrame:
+    zone_visits = _table(
+        "zones",
         """Table `zones` (zones.parquet), one row per zone: time in it (s), visits, latency (s).
 
-        `zones` are the shapes of the zones; `table("zones")` is the same table.
-        """
-        return self.table("zones")
+    `zones` are the shapes of the zones; `table("zones")` is the same table.
+    """,
+    )
 
     @cached_property
     def summary(self) -> pd.DataFrame:

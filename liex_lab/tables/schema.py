@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import WORDS
-from liex_lab.errors import SessionError
+from liex_lab.errors import SessionError, refuse
 from liex_lab.runtime.memory import blocks
 from liex_lab.scene.scene import Arena
 from liex_lab.scene.zones import Zone
@@ -444,15 +444,22 @@ def check_footer(path: Path, name: str, n_frames: int, n_joints: int) -> None:
         "rotations": n_frames * (n_joints + 1),
         "sessions": 1,
     }
-    if name in exact and n_rows != exact[name]:
-        raise ValueError(f"it has {n_rows} rows where the session has {exact[name]}")
-    # more is impossible: each frame has a timestamp
-    if n_rows > max(_FEW, 8 * (n_joints + 1) * path.stat().st_size):
-        raise ValueError(f"it claims {n_rows} rows, which a file of its size does not hold")
-    if name not in exact and n_rows > max(_FEW, 4 * n_frames):
-        raise ValueError(f"it claims {n_rows} rows for {n_frames} frames")
-    if len(found) != footer.num_columns:
-        raise ValueError("it has two columns of one name")
+    refuse(
+        ValueError,
+        (
+            n_rows != exact.get(name, n_rows),
+            f"it has {n_rows} rows where the session has {exact.get(name)}",
+        ),
+        (  # more is impossible: each frame has a timestamp
+            n_rows > max(_FEW, 8 * (n_joints + 1) * path.stat().st_size),
+            f"it claims {n_rows} rows, which a file of its size does not hold",
+        ),
+        (
+            name not in exact and n_rows > max(_FEW, 4 * n_frames),
+            f"it claims {n_rows} rows for {n_frames} frames",
+        ),
+        (len(found) != footer.num_columns, "it has two columns of one name"),
+    )
     for column in TABLES.get(name, ()):
         leaf = found.get(column.name)
         if leaf is None:
@@ -478,10 +485,17 @@ def check_rows(name: str, table: pd.DataFrame, joints: Sequence[str]) -> None:
         if column.name not in table:
             continue
         values = table[column.name]
-        if values.dtype.kind != _KINDS[column.dtype]:
-            raise ValueError(f"its column {column.name} is not {column.dtype}")
-        if column.dtype == "string" and values.hasnans:
-            raise ValueError(f"its column {column.name} lacks a value")
+        refuse(
+            ValueError,
+            (
+                values.dtype.kind != _KINDS[column.dtype],
+                f"its column {column.name} is not {column.dtype}",
+            ),
+            (
+                column.dtype == "string" and values.hasnans,
+                f"its column {column.name} lacks a value",
+            ),
+        )
     if "joint" in table and name in ("poses", "rotations"):
         own = [*joints] if name == "poses" else ["root", *joints]
         words = table["joint"]

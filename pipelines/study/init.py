@@ -13,17 +13,9 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import count
 from pathlib import Path
 
-from liex_lab.errors import StudyError
-from liex_lab.plan.study import (
-    CONTAINER,
-    DERIVED,
-    RAW,
-    STUDY_FILE,
-    Study,
-    find_subject,
-    letters,
-    same,
-)
+from liex_lab.errors import StudyError, refuse
+from liex_lab.plan.study import DERIVED, RAW, STUDY_FILE, Study
+from liex_lab.plan.subject import CONTAINER, find_subject, letters, same
 from liex_lab.recordings.open import stated_subject
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.progress import Progress, silent
@@ -83,16 +75,19 @@ def begin_study(
         StudyError: there is no such folder, no recording in it, or a study file already.
     """
     root = Path(folder)
-    if not root.is_dir():
-        raise StudyError(
-            f"a study begins in a folder with recordings, but {root} is none; check the path"
-        )
     file = root / STUDY_FILE
-    if file.exists() and not overwrite:
-        raise StudyError(
+    refuse(
+        StudyError,
+        (
+            not root.is_dir(),
+            f"a study begins in a folder with recordings, but {root} is none; check the path",
+        ),
+        (
+            file.exists() and not overwrite,
             f"{file} exists already; change it by hand, or say "
-            "--overwrite (in Python overwrite=True)"
-        )
+            "--overwrite (in Python overwrite=True)",
+        ),
+    )
     raw = root / RAW if (root / RAW).is_dir() else root
     found = find_recordings(raw)
     if not found:
