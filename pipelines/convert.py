@@ -49,19 +49,29 @@ _PICTURE = re.compile(r"frame_\d+\.png")
 
 @dataclass(frozen=True)
 class Converted:
-    """A recording that was written.
+    """A recording that was written, or an archive that was verified.
 
     Attributes:
         path: of the recording.
         n_frames: its number of frames.
         notes: sentences about what changed.
         problems: of the recording that was read.
+        source_bytes: size of the source recording; 0 if it is not in a file.
+        kept: share of an image's pixels that are kept.
+        verified: whether it was read again and compared.
+        written: whether it is new, rather than an existing one that was verified.
+        deleted: files that were removed.
     """
 
     path: Path
     n_frames: int
     notes: list[str]
     problems: list[str]
+    source_bytes: int = 0
+    kept: float = 1.0
+    verified: bool = False
+    written: bool = True
+    deleted: Sequence[Path] = ()
 
 
 def convert(
@@ -234,33 +244,6 @@ Mask = NDArray[np.bool_]
 _WIDER = (0.0, 0.03, 0.1)  # margins that are tried around the found region, of the image's width
 
 
-@dataclass(frozen=True)
-class Packed:
-    """Result of packing a recording.
-
-    Attributes:
-        path: the archive.
-        n_frames: its frames.
-        n_bytes: its size.
-        source_bytes: size of the source recording; 0 if it is not in a file.
-        kept: share of an image's pixels that are kept.
-        verified: whether it was read again and compared.
-        written: whether it is new, rather than an existing one that was verified.
-        deleted: files that were removed.
-        notes: sentences about the result.
-    """
-
-    path: Path
-    n_frames: int
-    n_bytes: int
-    source_bytes: int
-    kept: float
-    verified: bool
-    written: bool
-    deleted: list[Path]
-    notes: list[str]
-
-
 def pack(
     recording: str | Path,
     to: str | Path | None = None,
@@ -271,7 +254,7 @@ def pack(
     delete_original: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
-) -> Packed:
+) -> Converted:
     """Write the archive of a recording; it gets its name only once it is complete.
 
     With `verify`, an existing archive is checked against its stated hash instead.
@@ -316,23 +299,22 @@ def pack(
             digest = _write(opened, part, step_mm, mask, corners, progress)
             if verify or delete_original:
                 _compare(opened, part, mask, digest, progress)
-        done = Packed(
+        done = Converted(
             target,
             len(opened),
-            target.stat().st_size,
-            sum(source.stat().st_size for source in opened.sources),
-            1.0 if mask is None else float(mask.mean()),
-            verify or delete_original,
-            True,
-            list(opened.sources) if delete_original else [],
-            [*opened.problems, *notes],
+            notes,
+            list(opened.problems),
+            source_bytes=sum(source.stat().st_size for source in opened.sources),
+            kept=1.0 if mask is None else float(mask.mean()),
+            verified=verify or delete_original,
+            deleted=list(opened.sources) if delete_original else [],
         )
     for source in done.deleted:
         source.unlink()
     return done
 
 
-def _checked(path: str | Path, opened: Recording, progress: Progress) -> Packed:
+def _checked(path: str | Path, opened: Recording, progress: Progress) -> Converted:
     """Check times and images of an archive against its stated hash."""
     stated = opened.metadata["packed"]
     whole = hashlib.sha256()
@@ -344,8 +326,9 @@ def _checked(path: str | Path, opened: Recording, progress: Progress) -> Packed:
             f"{path} was cut or changed since it was packed: its times and images have another "
             "hash than it states; take another copy of it"
         )
-    size = Path(path).stat().st_size
-    return Packed(Path(path), len(opened), size, 0, 1.0, True, False, [], list(opened.problems))
+    return Converted(
+        Path(path), len(opened), [], list(opened.problems), verified=True, written=False
+    )
 
 
 def _target(

@@ -122,14 +122,12 @@ def open_anyhow(
 
 def _guess_camera(recording: Recording) -> str:
     """Set the likeliest camera for the recording's image size; returns what to write."""
-    width = recording.width
-    height = recording.height
+    width, height = recording.width, recording.height
     names = camera.of_size(width, height)
     # of the image's width: depth cameras have a field of view of 55 to 65 degrees
     focal = camera.preset(names[0], width, height).fx if names else round(0.9 * width, 1)
     like = f"those of a {names[0]}" if names else "those of many a depth camera"
-    cx = (width - 1) / 2
-    cy = (height - 1) / 2
+    cx, cy = (width - 1) / 2, (height - 1) / 2
     recording.camera = replace(
         recording.camera, fx=focal, fy=focal, cx=cx, cy=cy, source="assumed: not stated"
     )
@@ -233,7 +231,10 @@ def examine(
         proposal = Proposal(None, "")
         if median_mm is not None:
             found, scene = scene_facts(ideal, plan, water, sample, stride)
-            facts |= found | _session_size(ideal, plan, found.get("animal_length_mm"), median_mm)
+            facts |= found
+            if (length_mm := found.get("animal_length_mm")) is not None:
+                needed = session_bytes(ideal, plan, length_mm, median_mm)
+                facts["session_mb"] = round(needed / 1e6, 1)
             progress(0, None, "checking which plan fits")
             if propose or plan.arenas is not None:
                 arenas = _several(ideal, plan, misplaced)
@@ -241,11 +242,12 @@ def examine(
                 regions = [stated_corners(ideal, plan, one.region) for one in arenas[:1]]
                 first = ideal.masked(regions[0], lent=True) if regions else ideal
                 proposal = propose_plan(first, asked)
-        facts |= _time_facts(opened) | _lens_facts(opened.camera)
+        lens = opened.camera
+        unusual = ("" if water else camera.unusual_lens(lens), camera.unusual_centre(lens)[0])
         problems = [
             *ideal.problems,
             *filter(None, [timestamps.unwritable_times(opened.times_ns)]),
-            *_lens_problems(opened.camera, water, missing),
+            *filter(None, () if missing else unusual),
             *_time_problems(opened),
             *_copies_told(opened, sample),
             *unlikely,
@@ -255,6 +257,11 @@ def examine(
         ]
     n_arenas = len(arenas) if asked is None else 0
     facts |= {
+        **_time_facts(opened),
+        **{name: getattr(lens, name) for name in ("width", "height")},
+        **{name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")},
+        "intrinsics_source": lens.source,
+        "distortion": None if lens.distortion is None else lens.distortion.to_dict(),
         "water": None if water is None else water.to_dict(),
         "arenas": [line for one in arenas for line in arena_lines(one)],
         "plan": proposal.plan,
@@ -265,37 +272,6 @@ def examine(
         "next": next_command(path, proposal, missing, n_arenas, *typed),
     }
     return {key: facts.get(key) for key in FINDINGS}
-
-
-def _lens_facts(lens: camera.Camera) -> dict[str, Any]:
-    return {
-        **{name: getattr(lens, name) for name in ("width", "height")},
-        **{name: float(getattr(lens, name)) for name in ("fx", "fy", "cx", "cy")},
-        "intrinsics_source": lens.source,
-        "distortion": None if lens.distortion is None else lens.distortion.to_dict(),
-    }
-
-
-def _lens_problems(
-    lens: camera.Camera, water: refraction.Water | None, missing: list[str]
-) -> list[str]:
-    """Sentences on unusual intrinsics, unless they are guessed."""
-    if missing:
-        return []
-    return [
-        text
-        for text in ("" if water else camera.unusual_lens(lens), camera.unusual_centre(lens)[0])
-        if text
-    ]
-
-
-def _session_size(
-    ideal: Recording, plan: Plan, length_mm: float | None, distance_mm: float
-) -> dict[str, float]:
-    """Size of a session on disk, MB; {} if no animal is found."""
-    if length_mm is None:
-        return {}
-    return {"session_mb": round(session_bytes(ideal, plan, length_mm, distance_mm) / 1e6, 1)}
 
 
 def _several(ideal: Recording, plan: Plan, misplaced: list[str]) -> list[sections.SeveralArenas]:
@@ -574,8 +550,7 @@ def _floor_facts(
             f"as the animal from {least:g} mm above it; bring the camera nearer, keep sunlight "
             "out, or raise foreground.min_height_mm"
         )
-    facts = {"noise_mm": noise, "floor_unread_share": unread, "arena": arena.to_dict()}
-    return facts, problems
+    return {"noise_mm": noise, "floor_unread_share": unread, "arena": arena.to_dict()}, problems
 
 
 def _water_depth(
@@ -612,11 +587,8 @@ def _size_facts(
     """The animal's size, and how often and where it is found."""
     raised = scene.background - background[:: scene.stride, :: scene.stride]
     covered = scene.on_floor & (raised > min_height_mm) & (raised < scene.background)
-    area = float(
-        (scene.background[covered].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy)
-    )
-    # of the animal's area was in the background
-    still = area > 0.4 * scene.area_mm2
+    area = (scene.background[covered].astype(float) ** 2).sum() / (scene.grid.fx * scene.grid.fy)
+    still = bool(area > 0.4 * scene.area_mm2)  # so much of the animal was in the background
     problems = []
     if still:
         problems.append(
@@ -629,13 +601,12 @@ def _size_facts(
             f"the animal was found in only {share:.0%} of the inspected frames; cut off the time "
             "before it came and after it left, and check that the whole arena is in view"
         )
-    facts = {
+    return {
         "animal_length_mm": length,
         "animal_area_mm2": scene.area_mm2,
         "animal_share": share,
         "animal_sits_still": still,
-    }
-    return facts, problems
+    }, problems
 
 
 def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | None:
@@ -678,15 +649,11 @@ def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
         console.print("no problems found", style="green")
     for problem in (*findings["missing"], *findings["problems"]):
         console.print(Text(printable(f"- {problem}"), style="yellow"), soft_wrap=True)
-    if findings["arenas"]:
-        several = (
-            "several arenas are found; lines for a plan, with subject_id and group to be added:"
-        )
-        console.print(Text(several), soft_wrap=True)
-        for line in findings["arenas"]:
-            console.print(Text(line), soft_wrap=True)
-    if findings["next"]:
-        console.print(Text(printable(f"next: {findings['next']}")), soft_wrap=True)
+    several = "several arenas are found; lines for a plan, with subject_id and group to be added:"
+    arenas = [several, *findings["arenas"]] if findings["arenas"] else []
+    next_line = [printable(f"next: {findings['next']}")] if findings["next"] else []
+    for line in (*arenas, *next_line):
+        console.print(Text(line), soft_wrap=True)
 
 
 def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
@@ -694,7 +661,12 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
     from jinja2 import Environment
 
     environment = Environment()  # nosec B701: plain text for a terminal
-    environment.filters |= {"unit": _in_unit, "megabytes": megabytes}
+    environment.filters |= {
+        "unit": lambda value, unit, digits=0: (
+            "unknown" if value is None else f"{value:.{digits}f} {unit}"
+        ),
+        "megabytes": megabytes,
+    }
     scene = findings["scene"] or {}
     fixtures = [Fixture.from_dict(one) for one in scene.get("fixtures", [])]
     values = findings | {
@@ -710,7 +682,3 @@ def lines(findings: dict[str, Any]) -> list[tuple[str, str]]:
         for name, template in _TEXT["lines"].items()
     }
     return [(name, text) for name, text in texts.items() if text]
-
-
-def _in_unit(value: float | None, unit: str, digits: int = 0) -> str:
-    return "unknown" if value is None else f"{value:.{digits}f} {unit}"

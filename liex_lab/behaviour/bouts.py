@@ -275,14 +275,6 @@ def _mean_over(values: Array, hold: Array) -> float:
 Reading = Callable[[BoutReader, int, int], tuple[float, ...]]
 
 
-def _motion(*names: str) -> Reading:
-    return lambda bout, a, b: tuple(bout.motion(a, b)[name] for name in names)
-
-
-def _turn(name: str, sign: float = 1.0) -> Reading:
-    return lambda bout, a, b: (sign * bout.turn(a, b)[name],)
-
-
 def _beyond_noise(bout: BoutReader, a: int, b: int) -> float:
     """Mean speed minus the apparent speed caused by pose errors, mm/s."""
     noise = of_known(np.median, bout.column("speed_sd_mm_s", a, b))
@@ -291,20 +283,23 @@ def _beyond_noise(bout: BoutReader, a: int, b: int) -> float:
 
 # how to read each of `actions.vocabulary.MEASURES`; with two values, both must fit
 _READ: dict[str, Reading] = {
-    "speed_mm_s": _motion("mean_speed_mm_s", "median_speed_mm_s"),
-    "peak_speed_mm_s": _motion("peak_speed_mm_s"),
+    "speed_mm_s": lambda bout, a, b: (
+        bout.motion(a, b)["mean_speed_mm_s"],
+        bout.motion(a, b)["median_speed_mm_s"],
+    ),
+    "peak_speed_mm_s": lambda bout, a, b: (bout.motion(a, b)["peak_speed_mm_s"],),
     "quiet_bl_s": lambda bout, a, b: (_beyond_noise(bout, a, b) / bout.length_mm,),
     "speed_bl_s": lambda bout, a, b: (bout.motion(a, b)["mean_speed_mm_s"] / bout.length_mm,),
     "duration_s": lambda bout, a, b: (bout.seconds(a, b),),
-    "left_turn_rad": _turn("net_turn_rad"),
-    "right_turn_rad": _turn("net_turn_rad", -1.0),
+    "left_turn_rad": lambda bout, a, b: (bout.turn(a, b)["net_turn_rad"],),
+    "right_turn_rad": lambda bout, a, b: (-bout.turn(a, b)["net_turn_rad"],),
     "either_turn_rad": lambda bout, a, b: (abs(bout.turn(a, b)["net_turn_rad"]),),
-    "swing_rad": _turn("heading_range_rad"),
-    "bend_rad": _turn("bend_max_rad"),
+    "swing_rad": lambda bout, a, b: (bout.turn(a, b)["heading_range_rad"],),
+    "bend_rad": lambda bout, a, b: (bout.turn(a, b)["bend_max_rad"],),
     "usual_bend_rad": lambda bout, a, b: (
         of_known(np.median, np.abs(bout.column("bend_rad", a, b))),
     ),
-    "pitch_rad": _turn("mean_pitch_rad"),
+    "pitch_rad": lambda bout, a, b: (bout.turn(a, b)["mean_pitch_rad"],),
     "raised_bl": lambda bout, a, b: (bout.height(a, b)["peak_nose_over_rump_mm"] / bout.length_mm,),
     "moved_bl": lambda bout, a, b: (bout.motion(a, b)["displacement_mm"] / bout.length_mm,),
 }

@@ -228,9 +228,8 @@ def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict
     sd, correction = spread_of_animals(
         animal_means(rows["value"].to_numpy(float), number), subjects % 2 == 1
     )
-    values = (found.difference, found.low, found.high)
-    effects = (correction * value / sd if sd > 0 else np.nan for value in values)
-    return dict(zip((*_ESTIMATES, *_EFFECTS), (*values, *effects), strict=True))
+    effects = (correction * value / sd if sd > 0 else np.nan for value in found)
+    return dict(zip((*_ESTIMATES, *_EFFECTS), (*found, *effects), strict=True))
 
 
 def _tested(

@@ -226,19 +226,9 @@ MOST_EXACT = 20_000  # arrangements of an exact test, or random ones beyond that
 FEWEST_FOR_MODEL = 6  # units per group; with fewer, a model's variances are guesses
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """Second group minus first group, with its confidence interval.
-
-    Attributes:
-        difference: difference of the groups, in the measure's own unit.
-        low: lower limit of the interval; NaN if a group has fewer than two units.
-        high: upper limit of the interval; NaN if a group has fewer than two units.
-    """
-
-    difference: float
-    low: float
-    high: float
+# Second group minus first group in the measure's own unit, with the lower and upper limit of its
+# interval, which are NaN if a group has fewer than two units.
+Estimate = tuple[float, float, float]
 
 
 def estimate(units: Units, level: float = 0.95) -> Estimate:
@@ -270,7 +260,7 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
         a = y[~second]
         b = y[second]
         if min(len(a), len(b)) < 2:
-            return Estimate(float(b.mean() - a.mean()), np.nan, np.nan)
+            return float(b.mean() - a.mean()), np.nan, np.nan
         va = a.var(ddof=1) / len(a)
         vb = b.var(ddof=1) / len(b)
         difference = b.mean() - a.mean()
@@ -278,7 +268,7 @@ def estimate(units: Units, level: float = 0.95) -> Estimate:
         total = va**2 / (len(a) - 1) + vb**2 / (len(b) - 1)
         freedom = (va + vb) ** 2 / total if total > 0 else float(len(y) - 2)
     reach = float(t.ppf(0.5 + level / 2.0, max(freedom, 1.0))) * float(error)
-    return Estimate(float(difference), float(difference) - reach, float(difference) + reach)
+    return float(difference), float(difference) - reach, float(difference) + reach
 
 
 def _within_blocks(units: Units) -> tuple[float, float, float]:
@@ -457,7 +447,7 @@ def mixed_model(
     freedom = len(np.unique(clusters)) - 2
     reach = float(t.ppf(0.975, freedom)) * error
     p = float(2.0 * t.sf(abs(difference) / error, freedom))
-    return Estimate(difference, difference - reach, difference + reach), p, random
+    return (difference, difference - reach, difference + reach), p, random
 
 
 def _fit(values: Array, second: Array, clusters: NDArray[np.str_]) -> tuple[float, float] | None:

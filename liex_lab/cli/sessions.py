@@ -270,7 +270,7 @@ def show(
 
 def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Path]:
     """A replay of a session's full depth images; empty, with a note, if there is no recording."""
-    from liex_lab.pipelines.show import whole_images
+    from liex_lab.pipelines.drawing import whole_images
 
     try:
         with progress_bar() as progress:
@@ -287,7 +287,7 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
     from liex_lab.sessions.viewer import replays_with, show_replay
 
     if at_s is not None:
-        show_replay(replay, at_s, more).wait()
+        show_replay(replay, at_s, more)[0].wait()
         return
     # RERUN_ANALYTICS: no usage data leaves the laboratory; the viewer in a browser ignores it
     hosted: list[str] = []
@@ -419,9 +419,10 @@ def pack(
     if not done.written:
         say(f"archive: {done.path} ({done.n_frames} frames) is as it was packed")
         return
-    size = f"{done.n_bytes / 1e6:.1f} MB"
+    n_bytes = done.path.stat().st_size
+    size = f"{n_bytes / 1e6:.1f} MB"
     if done.source_bytes:
-        share = 100 * done.n_bytes / done.source_bytes
+        share = 100 * n_bytes / done.source_bytes
         size += f", {share:.0f}% of the recording's {done.source_bytes / 1e6:.1f} MB"
     say(f"archive: {done.path} ({done.n_frames} frames, {size})")
     say(f"kept:    {100 * done.kept:.0f}% of an image's pixels, bit for bit")
@@ -429,7 +430,7 @@ def pack(
         say("checked: every image and time equals the recording's")
     for path in done.deleted:
         say(f"removed: {path}")
-    for sentence in done.notes:
+    for sentence in (*done.problems, *done.notes):
         say(f"note: {sentence}")
 
 

@@ -20,11 +20,11 @@ from typing import IO, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, TypeAdapter
 
 from liex_lab.errors import SessionError
 from liex_lab.recordings.formats.messages.mcap import MAGIC, RECORD
-from liex_lab.runtime import durable, memory, places, text_files
+from liex_lab.runtime import durable, memory, places
 
 # between two checkpoints: the most work that can be lost, besides startup
 EVERY_S = 3.0
@@ -34,7 +34,13 @@ _SEEN = "seen"
 STRETCHES = "stretches"
 # of work: 300 years; also excludes integers too large for a float
 _MOST_S = 1e10
-_MOST = 1 << 20  # values per frame in one column
+# of each column, its dtype and the shape of a row
+_KINDS = TypeAdapter(
+    dict[
+        Annotated[str, Field(pattern=r"^[A-Za-z_]\w*$")],
+        tuple[str, list[Annotated[int, Field(ge=0, lt=1 << 20)]]],
+    ]
+)
 OWN = (_STATE, _LOCK, _SEEN, STRETCHES, "resumed.rrd")  # not in the finished session
 
 
@@ -416,15 +422,8 @@ def hold(folder: Path) -> IO[bytes] | None:
 
 def _read_kinds(folder: Path) -> dict[str, tuple[str, list[int]]]:
     """Dtype and row shape of the columns by name, from columns.json; empty if it is invalid."""
-    try:
-        kinds = {
-            name: (np.dtype(str(kind)), [int(n) for n in shape])
-            for name, (kind, shape) in text_files.loose_json(folder / "columns.json").items()
-        }
-    except (ValueError, TypeError, OverflowError):
-        return {}
-    sound = all(
-        name.isidentifier() and dtype.kind in "biufU" and all(0 <= n < _MOST for n in shape)
-        for name, (dtype, shape) in kinds.items()
-    )
-    return {name: (dtype.str, shape) for name, (dtype, shape) in kinds.items()} if sound else {}
+    with suppress(OSError, ValueError, TypeError):
+        kinds = _KINDS.validate_json((folder / "columns.json").read_bytes())
+        if all(np.dtype(dtype).kind in "biufU" for dtype, _ in kinds.values()):
+            return kinds
+    return {}

@@ -8,6 +8,7 @@ never removed, but numbered: NAME.outdated-2, NAME.outdated-3 and so on.
 
 import json
 import platform
+import re
 import shutil
 import traceback
 from datetime import UTC, datetime
@@ -305,7 +306,7 @@ def corrections_for(path: Path) -> Path | None:
     own = corrected_folder(path)
     if (own / LOG).is_file():
         return own
-    for copy in _outdated(path):
+    for copy in _outdated(path).values():
         try:
             if read_log(copy).entries:
                 return corrected_folder(copy)
@@ -346,23 +347,15 @@ def _waits(path: Path) -> bool:
     return not (path / "session.json").is_file() and (aside_folder(path) / "session.json").is_file()
 
 
-def _free(path: Path) -> Path:
-    """The next unused name NAME.outdated-2, NAME.outdated-3 ..."""
-    taken = [_number(path, copy) for copy in _outdated(path)]
-    return path.with_name(f"{path.name}.outdated-{max([1, *taken]) + 1}")
-
-
-def _outdated(path: Path) -> list[Path]:
-    """The outdated copies of a session, newest first."""
-    last = path.with_name(f"{path.name}.outdated")
+def _outdated(path: Path) -> dict[int, Path]:
+    """Outdated copies by number: the last one, which has none, as 0, then the latest first."""
+    name = re.compile(rf"{re.escape(path.name)}\.outdated(?:-0*([1-9]\d*))?", re.ASCII)
     beside = [*path.parent.iterdir()] if path.parent.is_dir() else []
-    numbered = [copy for copy in beside if _number(path, copy) and copy.is_dir()]
-    numbered.sort(key=lambda copy: _number(path, copy), reverse=True)
-    return [last, *numbered] if last.is_dir() else numbered
+    found = [(name.fullmatch(copy.name), copy) for copy in beside if copy.is_dir()]
+    numbered = {int(match[1] or 0): copy for match, copy in found if match}
+    return dict(sorted(numbered.items(), key=lambda one: (one[0] > 0, -one[0])))
 
 
-def _number(path: Path, copy: Path) -> int:
-    """The number of an outdated copy; 0 if it has none."""
-    begin = f"{path.name}.outdated-"
-    number = copy.name.removeprefix(begin) if copy.name.startswith(begin) else ""
-    return int(number) if number.isascii() and number.isdigit() else 0
+def _free(path: Path) -> Path:
+    """An unused name of an outdated copy."""
+    return path.with_name(f"{path.name}.outdated-{max([1, *_outdated(path)]) + 1}")

@@ -13,7 +13,6 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -54,16 +53,8 @@ from liex_lab.tracking.track import Track
 _LEAST, _MOST = 10, 27  # log2 of the windows that every Zstandard reader accepts
 
 
-@dataclass(frozen=True)
-class MessageType:
-    """Schema of a topic's messages, such as "foxglove.RawImage" in "protobuf" or "jsonschema", and
-    the encoding of the messages, "protobuf" or "json".
-    """
-
-    name: str
-    encoding: str
-    data: bytes
-    messages: str
+# of a topic's messages: the schema's name, encoding and content, and the messages' encoding
+MessageType = tuple[str, str, bytes, str]
 
 
 class _Chunk:
@@ -134,22 +125,13 @@ class McapLog:
             ldm_min_match=repetition,
         )
         self._packer = zstandard.ZstdCompressor(compression_params=packing)
-        kinds = {kind.name: kind for kind in topics.values()}
-        self._schemas = {
-            kind.name: Schema(id=k, data=kind.data, encoding=kind.encoding, name=kind.name)
-            for k, kind in enumerate(kinds.values(), 1)
-        }
-        self._channels = {
-            topic: Channel(
-                id=k,
-                topic=topic,
-                message_encoding=kind.messages,
-                schema_id=self._schemas[kind.name].id,
-                metadata={},
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[str, Channel] = {}
+        for k, (topic, (name, encoding, data, kind)) in enumerate(topics.items(), 1):
+            self._schemas[k] = Schema(id=k, data=data, encoding=encoding, name=name)
+            self._channels[topic] = Channel(
+                id=k, topic=topic, message_encoding=kind, schema_id=k, metadata={}
             )
-            for k, (topic, kind) in enumerate(topics.items(), 1)
-        }
-        self._topics = topics
         self._introduced: set[str] = set()
         self._counts: Counter[int] = Counter()
         self._chunks: list[ChunkIndex] = []
@@ -180,7 +162,7 @@ class McapLog:
         chunk = self._open
         if topic not in self._introduced:  # in the chunk of its first message
             self._introduced.add(topic)
-            chunk.put(_bytes_of(self._schemas[self._topics[topic].name]) + _bytes_of(channel))
+            chunk.put(_bytes_of(self._schemas[channel.id]) + _bytes_of(channel))
         index = chunk.indexes.setdefault(channel.id, MessageIndex(channel.id, []))
         index.records.append((time_ns, chunk.size))
         number = self._counts[channel.id] + len(index.records)
@@ -232,7 +214,7 @@ class McapLog:
         self._write(_bytes_of(DataEnd(0)))
         start = self._at
         channels = [channel for channel in self._channels.values() if self._counts[channel.id]]
-        used = {channel.schema_id for channel in channels}
+
         statistics = Statistics(
             attachment_count=0,
             channel_count=len(channels),
@@ -242,10 +224,10 @@ class McapLog:
             metadata_count=0,
             message_start_time=min((one.message_start_time for one in self._chunks), default=0),
             message_end_time=max((one.message_end_time for one in self._chunks), default=0),
-            schema_count=len(used),
+            schema_count=len(channels),
         )
         groups: dict[int, Sequence[McapRecord]] = {
-            Opcode.SCHEMA: [schema for schema in self._schemas.values() if schema.id in used],
+            Opcode.SCHEMA: [self._schemas[channel.id] for channel in channels],
             Opcode.CHANNEL: channels,
             Opcode.STATISTICS: [statistics],
             Opcode.CHUNK_INDEX: self._chunks,
@@ -314,11 +296,11 @@ _PROTOBUF: dict[str, Any] = {
 }
 _JSON = {"/predicted_error": _ERROR_SCHEMA, "/actions": _ACTION_SCHEMA}
 _TYPES = {
-    topic: MessageType(schema.name, schema.encoding, schema.data, "protobuf")
+    topic: (schema.name, schema.encoding, schema.data, "protobuf")
     for topic, kind in _PROTOBUF.items()
     if (schema := kind.get_schema())
 } | {
-    topic: MessageType(schema["title"], "jsonschema", json.dumps(schema).encode(), "json")
+    topic: (schema["title"], "jsonschema", json.dumps(schema).encode(), "json")
     for topic, schema in _JSON.items()
 }
 _BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)

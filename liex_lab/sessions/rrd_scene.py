@@ -84,7 +84,8 @@ class DepthColumns:
     def resume(self) -> None:
         """Continue another file, whose last visible entities are unknown."""
         cut_out = self._origin.background is not None
-        self._shown = set(cutout_entities() if cut_out else (DEPTH, NOISY))
+        cutouts = (cutout_entity(k, n) for k in range(N_BOXES) for n in range(N_WINDOWS))
+        self._shown = set(cutouts if cut_out else (DEPTH, NOISY))
 
     def take(
         self,
@@ -247,11 +248,6 @@ def cutout_entity(k: int, which: int) -> str:
     """
     entity = f"{CUTOUTS}/{k + 1}/depth"
     return f"{entity}/{which + 1}" if which else entity
-
-
-def cutout_entities() -> list[str]:
-    """All entities that may show a cut-out."""
-    return [cutout_entity(k, which) for k in range(N_BOXES) for which in range(N_WINDOWS)]
 
 
 def cutout_frame(k: int) -> str:

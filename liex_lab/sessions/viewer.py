@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,27 +29,6 @@ from liex_lab.sessions.session import Session
 from liex_lab.tracking.track import Track
 
 Made = TypeVar("Made")
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A viewer with an open replay.
-
-    Attributes:
-        process: the viewer's process.
-        client: Rerun's client that controls it.
-    """
-
-    process: subprocess.Popen[bytes]
-    client: Any
-
-    def wait(self) -> None:
-        """Wait until the viewer is closed."""
-        self.process.wait()
-
-    def close(self) -> None:
-        """Terminate the viewer."""
-        _end(self.process)
 
 
 def has_screen() -> bool:
@@ -91,8 +69,8 @@ def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:
 
 def show_replay(
     replay: Path, at_s: float, more: Sequence[Path] = (), *, headless: bool = False
-) -> Shown:
-    """Open a replay in a window at a given time; returns the viewer.
+) -> tuple[subprocess.Popen[bytes], Any]:
+    """Open a replay in a window at a given time; returns the viewer and the client controlling it.
 
     The viewer listens on 127.0.0.1 only and ends with this process.
 
@@ -112,12 +90,12 @@ def show_replay(
 
     port, process = _begin(*(["--headless"] if headless else []))
 
-    def opened() -> Shown:
+    def opened() -> tuple[subprocess.Popen[bytes], Any]:
         client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
         for file in replays_with(replay, more):
             client.open(str(file.resolve()))
         client.set_time("time", duration=at_s, play_state="paused")
-        return Shown(process, client)
+        return process, client
 
     return _once_up(process, opened, f"Rerun did not show {replay}; try `liex show` in a terminal")
 
@@ -154,7 +132,7 @@ def _once_up(process: subprocess.Popen[bytes], attempt: Callable[[], Made], fail
         except Exception as error:  # not started yet; Rerun's exception is not documented
             why = str(error).partition("\n")[0][:200]
             time.sleep(0.2)
-    _end(process)
+    end_viewer(process)
     sentence, _, remedy = failed.partition("; ")
     raise LiexError(f"{sentence} ({why}); {remedy}")
 
@@ -176,11 +154,11 @@ def _begin(*arguments: str, stays: bool = False) -> tuple[int, subprocess.Popen[
         stderr=subprocess.DEVNULL,
     )
     if not stays:
-        atexit.register(_end, viewer)
+        atexit.register(end_viewer, viewer)
     return port, viewer
 
 
-def _end(viewer: subprocess.Popen[bytes]) -> None:
+def end_viewer(viewer: subprocess.Popen[bytes]) -> None:
     """Terminate a viewer and its child processes: `rerun` is a wrapper around the real viewer."""
     if viewer.poll() is None:
         if hasattr(os, "killpg"):

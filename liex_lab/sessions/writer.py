@@ -385,7 +385,21 @@ class SessionWriter:
         (self._folder / "plan.toml").write_text(self.origin.plan_toml, encoding="utf-8")
         self._seconds += time.perf_counter() - began
         self._document["files"] = file_facts(self._folder)
-        self._document.update(self._account(of_track, dict(timings_s or {})))
+        elapsed = self._checkpoint.seconds_before + self._elapsed
+        written_s = {"write": round(self._seconds, 4), "total": round(elapsed, 4)}
+        self._document |= {
+            "frames": of_track.counts(),
+            "depth_unit_mm": 1.0,
+            "timings_s": {**(timings_s or {}), **written_s},
+            "frames_per_s": round(self.n_frames / elapsed, 2),
+            "peak_memory_mb": memory.peak_memory_mb(),
+            "machine": {
+                "name": platform.node(),
+                "system": platform.platform(),
+                "cores": os.cpu_count(),
+            },
+            "interruptions": self._checkpoint.n_interruptions,
+        }
         made = corrections_for(self.path)
         if made is not None and made.parent != self.path:
             self.note(corrections_taken_from=made.parent.name)
@@ -423,27 +437,6 @@ class SessionWriter:
     @property
     def _elapsed(self) -> float:
         return time.perf_counter() - self._started
-
-    def _account(self, results: Results, timings_s: dict[str, float]) -> dict[str, Any]:
-        """Counts of the frames, and the cost of the run."""
-        elapsed = self._checkpoint.seconds_before + self._elapsed
-        return {
-            "frames": results.counts(),
-            "depth_unit_mm": 1.0,
-            "timings_s": {
-                **timings_s,
-                "write": round(self._seconds, 4),
-                "total": round(elapsed, 4),
-            },
-            "frames_per_s": round(self.n_frames / elapsed, 2),
-            "peak_memory_mb": memory.peak_memory_mb(),
-            "machine": {
-                "name": platform.node(),
-                "system": platform.platform(),
-                "cores": os.cpu_count(),
-            },
-            "interruptions": self._checkpoint.n_interruptions,
-        }
 
     def _publish(self) -> None:
         """Move the whole folder into place; an older session is removed only once this one is on

@@ -30,7 +30,7 @@ from sklearn.tree import DecisionTreeClassifier
 
 from liex_lab.actions import channels, ethogram, storage, vocabulary
 from liex_lab.actions.labels import LabelledTrack, confusion, interval95, timeline_scores
-from liex_lab.actions.recogniser import DESCRIPTORS, SequenceForest, describe
+from liex_lab.actions.learning import DESCRIPTORS, SequenceForest, describe
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.behaviour.bouts import measure_bouts, recognise
 from liex_lab.behaviour.kinematics import Joints, kinematics

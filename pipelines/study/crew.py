@@ -29,8 +29,15 @@ from liex_lab.sessions.folder import (
 )
 from liex_lab.sessions.verdict import read_verdict
 
-from .sharing import LOOKING, LookAtSession, MeasuringStage, about, input_stamp
-from .status import SessionStatus, to_look_at
+from .status import (
+    LOOKING,
+    LookAtSession,
+    MeasuringStage,
+    SessionStatus,
+    about,
+    input_stamp,
+    to_look_at,
+)
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -28,8 +28,15 @@ from ..compare import find_sessions
 from ..compiling import compile_ahead
 from .cluster import SlurmTable, crew_of, is_encrypted
 from .crew import Crew, RunSession
-from .sharing import LookAtSession, look_at, to_be_looked_at, write_look
-from .status import SessionStatus, standings, to_look_at
+from .status import (
+    LookAtSession,
+    SessionStatus,
+    look_at,
+    standings,
+    to_be_looked_at,
+    to_look_at,
+    write_look,
+)
 
 
 def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[verdict.Entry]]]:

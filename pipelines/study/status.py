@@ -1,26 +1,397 @@
 """Status of a study's sessions: done, failed, or pending (again) and why; read from disk.
 
 No state is kept: a session is done while versions, plan, model and input in its session.json are
-current.
+current. If sessions share the size and shape of their animal, each is looked at first (look.json).
 """
 
+import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field
 
 from liex_lab.behaviour.cohort import unified
-from liex_lab.errors import LiexError
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.catalog import find_model, sha256
+from liex_lab.errors import LiexError, RecordingError
+from liex_lab.estimation.session_shape import PLACES
 from liex_lab.plan import Plan
-from liex_lab.plan.study import PlannedSession, Study, find_subject, same
+from liex_lab.plan.sections import N_PLACES, Factor, Positive, SharedBody, SharedShape
+from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
+from liex_lab.plan.subject import find_subject, same
+from liex_lab.runtime import durable, places
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.threads import in_background
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
-from liex_lab.sessions.folder import read_failure
+from liex_lab.sessions.folder import describe_failure, read_failure
+from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
 from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, state_in_words, verdict_in
+from liex_lab.tracking.own_shape import MOST_APART, SessionBody, agree, spread_of
 
-from .sharing import shared_sessions, what_changed
+from ..build import animal_facts, build_estimator, build_recording, open_planned, shape_labels
+from ..choice import fit_plan
+from ..session import MEASURING
+
+LOOKING = "looking at the animal"
+_DECIMALS = 4  # of a shape, relative to the length or to the average animal
+LookAtSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
+
+
+def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:
+    """Why a stored session.json, failed.json or look.json differs from the plan; '' if it does not.
+
+    Raises:
+        PlanError: the stored plan is not valid.
+    """
+    then = document.get("versions", {}).get("liex_lab", "")
+    if then != (now := package_version("liex_lab")):
+        return f"version changed: {then or 'unknown'}, now {now}"
+    if (schema := document.get("schema_version", SCHEMA_VERSION)) != SCHEMA_VERSION:
+        return f"version changed: session schema {schema}, now {SCHEMA_VERSION}"
+    if why := plan_changed(session.plan, document.get("plan", {})):
+        return why
+    model = document.get("model", {})
+    if model and model.get("sha256") != sha256(find_model(session.plan.estimation.model)):
+        return "model changed"
+    return _input_changed(session, document.get("input", {}))
+
+
+def plan_changed(plan: Plan, stored: dict[str, Any]) -> str:
+    """How a plan differs from the stored one of a session.json; '' if it does not."""
+    then = Plan.from_table(stored).model_dump()
+    now = plan.model_dump()
+    if plan.recording.mirrored is None:  # then it is estimated, and the result is stored
+        now["recording"]["mirrored"] = then["recording"]["mirrored"]
+    if now["animal"]["shared"] != then["animal"]["shared"]:
+        shared = plan.animal.shared
+        length = "" if shared is None or shared.spine_mm is None else f", {shared.spine_mm:g} mm"
+        now["animal"]["shared"] = "nothing" if shared is None else f"by {shared.by}{length}"
+    skipped = {"report", *(f"session.{key}" for key in DESCRIBED)}  # do not affect measurements
+    values, before = (
+        {
+            f"{section}.{key}" if key else section: value
+            for section, part in plan.items()
+            for key, value in (part.items() if isinstance(part, dict) else [("", part)])
+            if section not in skipped
+        }
+        for plan in (now, then)
+    )
+    differing = [
+        f"{name} = {value}"
+        for name, value in values.items()
+        if value != before.get(name) and name not in skipped
+    ]
+    more = f" and {len(differing) - 3} more" if len(differing) > 3 else ""
+    return f"plan changed: {', '.join(differing[:3])}{more}" if differing else ""
+
+
+def _input_changed(session: PlannedSession, stored: dict[str, Any]) -> str:
+    """Compare the input by its files' sizes and times; if these differ, by content."""
+    if stored.get("stamp") == input_stamp(session.recording):
+        return ""
+    if session.recording.startswith(VIRTUAL):
+        return "input changed: another virtual recording"
+    if not stored.get("sha256"):
+        return "input changed: sizes or times of its files"
+    if not session.recording_exists:
+        return ""  # keep the results, as the recording is gone
+    with open_planned(session.recording, session.plan) as recording:
+        return "" if recording.digest() == stored["sha256"] else "input changed: its content"
+
+
+def input_stamp(recording: str) -> str:
+    """A short hash of names, sizes and times of a recording's files and metadata files.
+
+    It is cheap, as no content is read. Metadata are files next to it such as .toml, .csv and .json.
+
+    Args:
+        recording: a path, or the address of a virtual recording, which is returned unchanged.
+
+    Returns:
+        32 hexadecimal digits; '' if there is no recording.
+    """
+    if recording.startswith(VIRTUAL):
+        return recording
+    path = Path(recording)
+    if not path.exists():
+        return ""
+    whole = path.is_dir()
+    folder = path if whole else path.parent
+    notes = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}  # metadata next to a recording
+    entries = []
+    for file in folder.rglob("*") if whole else folder.iterdir():
+        if (whole or file == path or file.suffix.lower() in notes) and not file.is_dir():
+            with suppress(OSError):  # it has just been removed
+                found = file.stat()
+                entries.append([str(file.relative_to(folder)), found.st_size, found.st_mtime_ns])
+    return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+
+
+class _ShapeFound(_Part):
+    kept: bool = False
+    n_frames: int = Field(0, ge=0)
+    residual_mm: float | None = None
+    width: list[float] = []
+    height: list[float] = []
+    joints_moved: list[list[float]] = []
+
+
+class _AnimalFound(_Part):
+    spine_mm: Positive
+    girth: Factor
+    shape: _ShapeFound | None = None
+
+
+class _Look(_Part):
+    """The entries of look.json that are read if an animal was found."""
+
+    animal: _AnimalFound
+    log_sd: float = Field(ge=0.0)
+    n_frames: int = Field(ge=1)
+    stated: bool
+
+
+def shared_sessions(study: Study) -> list[tuple[PlannedSession, str]]:
+    """The sessions of a study, in order, with size and shape shared by the stored findings.
+
+    Returns:
+        Each session, whose plan has the shared values or whose remark states why there are none;
+        and the id of a session of its animal that has to be inspected first; '' if all were.
+    """
+    known = {session.id: (session, "") for session in study.sessions}
+    for group in _groups(study):
+        looks: dict[str, Any] = {session.id: read_look(session) for session in group}
+        missing = next((id for id, look in looks.items() if look is None), "")
+        members = group if missing else together(group, looks)
+        known |= {session.id: (session, missing) for session in members}
+    return list(known.values())
+
+
+def to_be_looked_at(
+    study: Study, only: Sequence[str] = (), retry: bool = False, again: bool = False
+) -> list[PlannedSession]:
+    """Sessions to inspect before others of their animal are measured.
+
+    Args:
+        study: the study.
+        only: ids of the sessions to measure; () means all.
+        retry: inspect failed ones again.
+        again: inspect all again.
+    """
+
+    def is_pending(session: PlannedSession) -> bool:
+        look = None if again else read_look(session)
+        return look is None or (retry and "failure" in look)
+
+    groups = [g for g in _groups(study) if not only or any(one.id in only for one in g)]
+    return [session for group in groups for session in group if is_pending(session)]
+
+
+def _groups(study: Study) -> list[list[PlannedSession]]:
+    """The sessions of each animal that may share: two or more with one skeleton and model."""
+    if study.table.shared == "off":
+        return []
+    groups: dict[tuple[str, str, str], list[PlannedSession]] = {}
+    for session in study.sessions:
+        plan = session.plan
+        if not session.exclude and plan.animal.shared is None:
+            key = session.animal.id, plan.animal.skeleton, plan.estimation.model
+            groups.setdefault(key, []).append(session)
+    return [group for group in groups.values() if len(group) > 1]
+
+
+def together(
+    group: Sequence[PlannedSession], looks: Mapping[str, dict[str, Any]]
+) -> list[PlannedSession]:
+    """The sessions of one animal with the shared values in their plans, or why there are none."""
+    subject = group[0].animal.id
+    taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
+    alone = f"The sessions of {subject} do not share size and shape"
+    if len(taking_part) < 2:
+        shown_by = "one of them alone" if taking_part else "none of them"
+        return [replace(s, remark=f"{alone}: {shown_by} shows the animal.") for s in group]
+    found = list(taking_part.values())
+    if (spread := spread_of(found)) > MOST_APART:
+        lengths = sorted(one.spine_mm for one in found)
+        why = (
+            f"{alone}: their lengths, {lengths[0]:.1f} to {lengths[-1]:.1f} mm, lie {spread:.1%} "
+            f"apart, more than {MOST_APART:.0%}; each keeps its own."
+        )
+        return [replace(s, remark=why) for s in group]
+    agreed = agree(found)
+    body = SharedBody(
+        subject=subject,
+        n_sessions=len(found),
+        spine_mm=None if agreed.spine_mm is None else round(agreed.spine_mm, 3),
+        girth=None if agreed.girth is None else round(agreed.girth, _DECIMALS),
+        shape=None if agreed.shape is None else _shape(agreed.shape),
+    )
+    animals = {s.id: s.plan.animal.model_copy(update={"shared": body}) for s in group}
+    return [
+        replace(s, plan=s.plan.model_copy(update={"animal": animals[s.id]}))
+        if s.id in taking_part
+        else replace(
+            s,
+            remark=f"{s.id} does not share size and shape with the other sessions of {subject}: "
+            f"{_why_not(looks[s.id])}.",
+        )
+        for s in group
+    ]
+
+
+def _why_not(look: Mapping[str, Any]) -> str:
+    """Why a session is not used for its animal's shared values; '' if it is."""
+    if "failure" in look:
+        return str(look["failure"].get("reason", ""))
+    return ", and ".join(map(str, look["misfits"]))
+
+
+def found_in(look: Mapping[str, Any]) -> SessionBody:
+    """The findings on an animal, from `look_at` of a session that shows it.
+
+    Raises:
+        ValueError: it is damaged.
+    """
+    read = _Look.model_validate(look)
+    shape = read.animal.shape or _ShapeFound()
+    stated = shape.model_dump(include={"width", "height", "joints_moved"})
+    return SessionBody(
+        read.animal.spine_mm,
+        read.stated,
+        read.log_sd,
+        read.n_frames,
+        read.animal.girth,
+        shape_labels(SharedShape.model_validate(stated)) if shape.kept else None,
+        # a shape was tried, and rejected on held-out frames
+        not shape.kept and shape.residual_mm is not None,
+        shape.n_frames,
+    )
+
+
+def _shape(labels: Any) -> SharedShape:
+    p = len(PLACES)
+    return SharedShape(
+        width=np.exp(labels[-2 * p : -p]).round(_DECIMALS).tolist(),
+        height=np.exp(labels[-p:]).round(_DECIMALS).tolist(),
+        joints_moved=labels[: -2 * p].reshape(-1, 3).round(_DECIMALS).tolist(),
+    )
+
+
+class MeasuringStage:
+    """Forwards progress, and stores stage and frame for the report of a failure.
+
+    Attributes:
+        name: the stage.
+        frame: number of measured frames; None before the first one.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self.name = "opening the recording"
+        self.frame: int | None = None
+        self._progress = progress
+
+    def __call__(self, done: int, total: int | None, what: str) -> None:
+        """Store the stage, and forward the progress."""
+        self.name = what
+        self.frame = done if what == MEASURING else self.frame
+        self._progress(done, total, what)
+
+
+def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, Any]:
+    """Estimate the animal's size and shape from a session's sampled frames, without writing files.
+
+    Returns:
+        The content of look.json: plan, model and input, and `animal`, `log_sd`, `n_frames`,
+            `stated` and `misfits`, or `failure`.
+    """
+    stage = MeasuringStage(progress)
+    try:
+        return about(session) | _found(session, stage)
+    except Exception as error:
+        return about(session) | {"failure": describe_failure(error, stage.name, None)}
+
+
+def about(session: PlannedSession) -> dict[str, Any]:
+    """The inputs of an inspection: version, plan and input."""
+    return {
+        "session_id": session.id,
+        "schema_version": SCHEMA_VERSION,
+        "versions": versions(),
+        "plan": session.plan.model_dump(exclude_none=True),
+        "input": {"stamp": input_stamp(session.recording)},
+    }
+
+
+def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
+    if not session.recording_exists:
+        raise RecordingError(
+            f"there is no recording {session.recording}; correct its path, or copy it there"
+        )
+    plan = session.plan
+    with (
+        in_background(partial(build_estimator, plan)) as estimator,
+        build_recording(session.recording, plan, progress) as opened,
+    ):
+        progress(0, None, LOOKING)
+        fitted = fit_plan(opened, plan, estimator, progress=progress)
+    tracker = fitted.tracker
+    fit = tracker.sample_fit
+    return {
+        "model": {"sha256": sha256(find_model(plan.estimation.model))},
+        "animal": animal_facts(fitted.plan, tracker),
+        "log_sd": round(tracker.size_spread, 6),
+        "n_frames": 0 if fit is None else fit.n_found,
+        "stated": plan.animal.spine_mm is not None,
+        "misfits": list(fitted.misfits),
+    }
+
+
+def look_file(session: PlannedSession) -> Path:
+    """The path of a session's look.json, next to its results."""
+    return session.folder.with_name("look.json")
+
+
+def write_look(session: PlannedSession, look: dict[str, Any]) -> None:
+    """Write the findings on a session atomically."""
+    file = look_file(session)
+    places.unlinked(file.parent).mkdir(parents=True, exist_ok=True)
+    durable.write_whole(
+        file, json.dumps(places.storable_document(look), indent=1, default=str) + "\n"
+    )
+
+
+def read_look(session: PlannedSession) -> dict[str, Any] | None:
+    """The stored findings on a session; None if there are none, or they are outdated.
+
+    If the recording is gone, they remain valid as long as the rest is unchanged.
+    """
+    try:
+        look = json.loads(look_file(session).read_text(encoding="utf-8"))
+        failed = "failure" in look
+        if not failed and not session.recording_exists:
+            look = look | {"input": {"stamp": input_stamp(session.recording)}}
+        if what_changed(session, look):
+            return None
+        if not _why_not(look) and not failed:
+            found = found_in(look)
+            n_joints = Skeleton.load(session.plan.animal.skeleton).n_joints
+            if found.shape is not None and len(found.shape) != 3 * n_joints + 2 * N_PLACES:
+                return None
+    except (OSError, LiexError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+    return dict(look)
+
 
 State = Literal["done", "failed", "new", "begun", "changed", "excluded"]
 

@@ -7,7 +7,7 @@ import pytest
 
 from liex_lab.actions.channels import channel_names, segments_of, window_features
 from liex_lab.actions.labels import some_rows
-from liex_lab.actions.recogniser import position_descriptor, tangent_descriptor
+from liex_lab.actions.learning import position_descriptor, tangent_descriptor
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import on_disk

@@ -222,23 +222,23 @@ def test_the_skeleton_moved_as_the_track_says(pictures, session: Session) -> Non
 def test_what_was_corrected_is_shown_in_place_of_what_was_measured(
     session: Session, tmp_path: Path
 ) -> None:
-    from liex_lab.sessions.viewer import show_replay
+    from liex_lab.sessions.viewer import end_viewer, show_replay
 
     folder = Path(shutil.copytree(session.path, tmp_path / session.path.name))
     place = session.poses.loc[MOMENTS[0] * 5 + 4, ["x_mm", "y_mm", "z_mm"]].to_numpy(
         float
     ) + np.array([0, 0, 30.0])
     correct_session(folder, [joint_move(session, MOMENTS[0], "nose", place)])
-    shown = show_replay(folder / "session.rrd", MOMENTS[0] / 30, headless=True)
+    process, client = show_replay(folder / "session.rrd", MOMENTS[0] / 30, headless=True)
     try:
         ends, origins = time.monotonic() + 20.0, set[str]()
         while time.monotonic() < ends and "/corrected/kinematics/speed_cm_s" not in origins:
             time.sleep(0.5)
-            views = shown.client.get_state().views
+            views = client.get_state().views
             origins = {view.origin for view in views}
         assert {"/corrected/ethogram", "/corrected/kinematics/speed_cm_s"} <= origins
         assert not [report for view in views for report in view.reports]
-        (recording,) = shown.client.get_state().recordings
+        (recording,) = client.get_state().recordings
         assert recording.timelines, "both files are one recording"
     finally:
-        shown.close()
+        end_viewer(process)

@@ -77,7 +77,7 @@ def pretended_run(
 
 def pretended_look(session: PlannedSession, progress: Progress) -> dict[str, Any]:
     """Stands in for `sharing.look_at`: the recording holds the animal's length, mm."""
-    from liex_lab.pipelines.study.sharing import about
+    from liex_lab.pipelines.study.status import about
 
     from liex_lab.catalog import find_model, sha256
 

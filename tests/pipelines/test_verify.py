@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import rerun.chunk
 from liex_lab.pipelines import verify
-from liex_lab.pipelines.show import whole_images
+from liex_lab.pipelines.drawing import whole_images
 from liex_lab.pipelines.verify import Finding, verify_session
 from typer.testing import CliRunner
 

@@ -14,11 +14,12 @@ from mcap.stream_reader import StreamReader
 
 from liex_lab.errors import SessionError
 from liex_lab.sessions.checkpoint import append_chunks
-from liex_lab.sessions.mcap import McapLog, MessageType
+from liex_lab.sessions.mcap import McapLog
 
-ONE = MessageType("one", "jsonschema", b"{}", "json")
-OTHER = MessageType("other", "jsonschema", b'{"type": "object"}', "json")
-TOPICS = {"/a": ONE, "/b": OTHER}
+TOPICS = {
+    "/a": ("one", "jsonschema", b"{}", "json"),
+    "/b": ("other", "jsonschema", b'{"type": "object"}', "json"),
+}
 Messages = list[tuple[str, int, bytes]]
 
 
@@ -80,9 +81,8 @@ def test_every_message_is_found_by_the_index_in_the_order_of_time(settings: dict
     assert summary.statistics.message_start_time == min(one[1] for one in made)
     assert summary.statistics.message_end_time == max(one[1] for one in made)
     assert len(summary.chunk_indexes) == summary.statistics.chunk_count
-    assert {s.name: s.data for s in summary.schemas.values()} == {
-        one.name: one.data for one in (ONE, OTHER)
-    }
+    expected = {name: data for name, _, data, _ in TOPICS.values()}
+    assert {s.name: s.data for s in summary.schemas.values()} == expected
     names = [type(one).__name__ for one in StreamReader(file, validate_crcs=True).records]
     assert (names[0], names[-1], names.count("Message")) == ("Header", "Footer", 60)
     assert "Message" not in names[names.index("DataEnd") :]

@@ -15,8 +15,7 @@ from liex_lab.pipelines.study import cluster
 from liex_lab.pipelines.study.cluster import SlurmTable
 from liex_lab.pipelines.study.crew import measure_one, n_shared
 from liex_lab.pipelines.study.run import list_sessions, write_study_table
-from liex_lab.pipelines.study.sharing import plan_changed
-from liex_lab.pipelines.study.status import standing, standings
+from liex_lab.pipelines.study.status import plan_changed, standing, standings
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
@@ -163,7 +162,7 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     file.write_text(text + "set = { behaviour.rear_height_mm = 41.0 }\n")
     assert why(file) == ("changed", "plan changed: behaviour.rear_height_mm = 41.0")
     file.write_text(text)
-    monkeypatch.setattr("liex_lab.pipelines.study.sharing.package_version", lambda name: "9.9")
+    monkeypatch.setattr("liex_lab.pipelines.study.status.package_version", lambda name: "9.9")
     assert why(file)[1].startswith("version changed: ")
     monkeypatch.undo()
     assert why(file) == ("done", "")
@@ -177,7 +176,7 @@ def test_a_session_is_done_again_only_when_input_plan_or_version_changed(
     ):
         opened = nullcontext(SimpleNamespace(digest=lambda digest=digest: digest))
         monkeypatch.setattr(
-            "liex_lab.pipelines.study.sharing.open_planned", lambda *_, opened=opened: opened
+            "liex_lab.pipelines.study.status.open_planned", lambda *_, opened=opened: opened
         )
         assert why(file) == expected
     recording.unlink()

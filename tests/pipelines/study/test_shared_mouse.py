@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from liex_lab.pipelines.study.sharing import look_file
+from liex_lab.pipelines.study.status import look_file
 
 from liex_lab import api
 from liex_lab.plan.study import Study

@@ -8,11 +8,15 @@ from typing import Any
 
 import pytest
 from liex_lab.pipelines.correct import correct_session
-from liex_lab.pipelines.study import sharing
+from liex_lab.pipelines.study import status
 from liex_lab.pipelines.study.crew import measure_one
 from liex_lab.pipelines.study.run import list_sessions, run_study, study_rows
-from liex_lab.pipelines.study.sharing import shared_sessions, to_be_looked_at
-from liex_lab.pipelines.study.status import SessionStatus, standings
+from liex_lab.pipelines.study.status import (
+    SessionStatus,
+    shared_sessions,
+    standings,
+    to_be_looked_at,
+)
 
 from liex_lab.errors import LiexError, PlanError, StudyError
 from liex_lab.plan import Plan
@@ -263,7 +267,7 @@ def test_a_look_outlives_its_recording_and_a_damaged_one_is_made_again(tmp_path:
     shutil.move(recording, tmp_path / "a.mcap")
     assert to_be_looked_at(Study.load(file)) == []
     shutil.move(tmp_path / "a.mcap", recording)
-    look = sharing.look_file(found["a"].session)
+    look = status.look_file(found["a"].session)
     good = json.loads(look.read_text())
     for text in (
         "",
