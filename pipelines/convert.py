@@ -336,7 +336,7 @@ def _target(
 ) -> Path:
     """Path of the archive."""
     beside = Path(recording).parent if opened.sources else Path()
-    target = Path(to) if to is not None else places.inside(beside, opened.name, f"{SUFFIX}.mcap")
+    target = Path(to) if to is not None else durable.inside(beside, opened.name, f"{SUFFIX}.mcap")
     refuse(
         RecordingError,
         (

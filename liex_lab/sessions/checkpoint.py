@@ -24,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, TypeAdapter
 
 from liex_lab.errors import SessionError
 from liex_lab.recordings.formats.messages.mcap import MAGIC, RECORD
-from liex_lab.runtime import durable, memory, places
+from liex_lab.runtime import durable, memory
 
 # between two checkpoints: the most work that can be lost, besides startup
 EVERY_S = 3.0

@@ -23,7 +23,7 @@ from pydantic.dataclasses import dataclass
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError, one_line, refuse
-from liex_lab.runtime.places import safe_name
+from liex_lab.runtime.durable import safe_name
 from liex_lab.sessions.verdict import ALSO, WHO
 
 FOLDER = "corrected"

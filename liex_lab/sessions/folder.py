@@ -18,7 +18,7 @@ from typing import Any
 
 from liex_lab.catalog import sha256
 from liex_lab.errors import LiexError, SessionError, refuse
-from liex_lab.runtime import durable, memory, places, text_files
+from liex_lab.runtime import durable, memory, text_files
 from liex_lab.sessions.checkpoint import OWN, hold
 from liex_lab.sessions.corrections import FOLDER, LOG, corrected_folder, read_log
 from liex_lab.sessions.provenance import versions

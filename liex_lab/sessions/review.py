@@ -24,7 +24,7 @@ from pydantic.dataclasses import dataclass
 
 from liex_lab.actions.labels import RaterAgreement, cohens_kappa
 from liex_lab.errors import SessionError, one_line, refuse
-from liex_lab.runtime import durable, places
+from liex_lab.runtime import durable
 from liex_lab.sessions.corrections import UNREADABLE
 from liex_lab.sessions.session import Session
 

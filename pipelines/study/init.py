@@ -14,8 +14,16 @@ from itertools import count
 from pathlib import Path
 
 from liex_lab.errors import StudyError, refuse
-from liex_lab.plan.study import DERIVED, RAW, STUDY_FILE, Study
-from liex_lab.plan.subject import CONTAINER, find_subject, letters, same
+from liex_lab.plan.study import (
+    CONTAINER,
+    DERIVED,
+    RAW,
+    STUDY_FILE,
+    Study,
+    find_subject,
+    letters,
+    same,
+)
 from liex_lab.recordings.open import stated_subject
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.progress import Progress, silent

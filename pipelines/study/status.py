@@ -24,11 +24,10 @@ from liex_lab.errors import LiexError, RecordingError
 from liex_lab.estimation.session_shape import PLACES
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import N_PLACES, Factor, Positive, SharedBody, SharedShape
-from liex_lab.plan.study import VIRTUAL, PlannedSession, Study
-from liex_lab.plan.subject import find_subject, same
-from liex_lab.runtime import durable, places
+from liex_lab.plan.study import VIRTUAL, PlannedSession, Study, find_subject, same
+from liex_lab.runtime import durable
+from liex_lab.runtime.processes import in_background
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.threads import in_background
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.folder import describe_failure, read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
@@ -365,9 +364,9 @@ def look_file(session: PlannedSession) -> Path:
 def write_look(session: PlannedSession, look: dict[str, Any]) -> None:
     """Write the findings on a session atomically."""
     file = look_file(session)
-    places.unlinked(file.parent).mkdir(parents=True, exist_ok=True)
+    durable.unlinked(file.parent).mkdir(parents=True, exist_ok=True)
     durable.write_whole(
-        file, json.dumps(places.storable_document(look), indent=1, default=str) + "\n"
+        file, json.dumps(durable.storable_document(look), indent=1, default=str) + "\n"
     )
 
 
