@@ -7,7 +7,6 @@ is the mean-shift mode of the votes (Lie-X section 5.2).
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
 from liex_lab.estimation._cascade_kernels import mode_of_votes
 from liex_lab.estimation._feature_kernels import correct_base, correct_joint, fill_view, place_joint
@@ -86,8 +85,8 @@ def animal_points(heights, packed_camera, phase, points):
             seen += 1
 
 
-@kernel(parallel=True)
-def points_all(heights, crop_cameras, image, phases, points):
+@kernel(nogil=True)
+def points_all(heights, crop_cameras, image, phases, points, start, stop):
     """`animal_points` for a batch of images.
 
     Args:
@@ -96,13 +95,15 @@ def points_all(heights, crop_cameras, image, phases, points):
         image: (n,) index of each sample's height map.
         phases: (n,) in [0, 1).
         points: (n, P, 3) filled, mm, view frame.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(image.size):
+    for s in range(start, stop):
         animal_points(heights[image[s]], crop_cameras[image[s]], phases[s], points[s])
 
 
-@kernel(parallel=True)
-def views_all(crop_cameras, image, places, headings, reach, views):
+@kernel(nogil=True)
+def views_all(crop_cameras, image, places, headings, reach, views, start, stop):
     """Linearised projections at given positions, with offsets turned by a heading.
 
     Args:
@@ -112,8 +113,10 @@ def views_all(crop_cameras, image, places, headings, reach, views):
         headings: (n,) rad, about the view's z axis.
         reach: largest feature offset, mm.
         views: (n, 1, 9) float32, filled.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(image.size):
+    for s in range(start, stop):
         turned = np.eye(3)
         turn_to(headings[s], turned)
         fill_view(turned, places[s], crop_cameras[image[s]], 1.0, reach, views[s, 0])
@@ -212,9 +215,11 @@ def locate(heights, packed_camera, phase, settings, forest, used, place):
     return heading
 
 
-@kernel(parallel=True)
-def locate_all(heights, crop_cameras, image, phases, settings, forest, used, places, headings):
-    """`locate` for a batch of images, in parallel.
+@kernel(nogil=True)
+def locate_all(
+    heights, crop_cameras, image, phases, settings, forest, used, places, headings, start, stop
+):
+    """`locate` for a batch of images.
 
     Args:
         heights: (m, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
@@ -226,8 +231,10 @@ def locate_all(heights, crop_cameras, image, phases, settings, forest, used, pla
         used: (n, T) bool, the trees that vote.
         places: (n, 3) filled, mm, view frame.
         headings: (n,) filled, rad.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for s in prange(image.size):
+    for s in range(start, stop):
         headings[s] = locate(
             heights[image[s]],
             crop_cameras[image[s]],
@@ -276,9 +283,11 @@ def unfold(values, levers, place, heading, tree, rotations, positions):
     return scale
 
 
-@kernel(parallel=True)
-def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree, positions):
-    """Joints of the frames in which an animal was found, in parallel.
+@kernel(nogil=True)
+def guess_all(
+    heights, crop_cameras, found, settings, where, pose, levers, tree, positions, start, stop
+):
+    """Joints of the frames in which an animal was found.
 
     Args:
         heights: (n, S, S) int16 height maps, 1/16 mm, 0 where there is no animal.
@@ -290,9 +299,11 @@ def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree,
         levers: (D,) lever arms of F2's coordinates.
         tree: `KinematicTree` of the skeleton.
         positions: (n, J, 3) joints, mm, view frame; filled where an animal was found.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
     n_joints = tree.parents.size
-    for i in prange(heights.shape[0]):
+    for i in range(start, stop):
         if not found[i]:
             continue
         place = np.empty(3)
@@ -324,9 +335,9 @@ def guess_all(heights, crop_cameras, found, settings, where, pose, levers, tree,
         unfold(values, levers, place, heading, tree, rotations, positions[i])
 
 
-@kernel(parallel=True)
-def frames_all(heights, crop_cameras, frames):
-    for k in prange(len(crop_cameras)):
+@kernel(nogil=True)
+def frames_all(heights, crop_cameras, frames, start, stop):
+    for k in range(start, stop):
         camera = crop_camera(crop_cameras[k])
         low = np.full(2, 1 << 30)
         high = np.full(2, -1)
@@ -361,9 +372,9 @@ def shade(heights, row, column, level, per_mm):
     )
 
 
-@kernel(parallel=True)
-def patches_all(heights, crop_cameras, frames, patches):
-    for k in prange(len(crop_cameras)):
+@kernel(nogil=True)
+def patches_all(heights, crop_cameras, frames, patches, start, stop):
+    for k in range(start, stop):
         camera = crop_camera(crop_cameras[k])
         scale = 2.0 * frames[k, 2] / camera.step / PATCH  # height map pixels per patch pixel
         left = (frames[k, 0] - frames[k, 2] - camera.u0) / camera.step

@@ -52,7 +52,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, check_forest
 from liex_lab.forests.grow import GrowthPlan, grow_forest
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.processes import threads
+from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, in_camera_frame
 
 Array = NDArray[np.float64]
@@ -220,9 +220,6 @@ class PlainMean(Baseline):
 
 _F1 = GrowthPlan(7, 20, 10, 300, 0.5, 0.0, 0.0, 0.63)
 _F2 = GrowthPlan(12, 20, 5, 300, 0.5, 0.0, 0.0, 0.63)
-_N_WHERE = 5  # length of a leaf vector of F1
-# of the animal's length: a rotation about its own axis moves no joint of a straight animal
-_LEAST_LEVER = 0.05
 
 
 @dataclass(frozen=True)
@@ -269,7 +266,7 @@ class RegressionForest(Baseline):
     def __post_init__(self) -> None:
         """Refuse forests that do not match their samples, since kernels do not check bounds."""
         n_coordinates = len(levers(self.skeleton))
-        for name, forest, n in (("F1", self.where, _N_WHERE), ("F2", self.pose, n_coordinates)):
+        for name, forest, n in (("F1", self.where, 5), ("F2", self.pose, n_coordinates)):
             try:
                 check_forest(forest, 1, 0, n)
             except ValueError as error:
@@ -285,7 +282,9 @@ class RegressionForest(Baseline):
         s = with_home_turn(self.skeleton, self.plan.home_turn)
         joints = np.full((len(crop_cameras), s.n_joints, 3), np.nan)
         with threads(parallel):
-            kernels.guess_all(
+            in_parallel(
+                kernels.guess_all,
+                len(crop_cameras),
                 crops.heights,
                 crop_cameras,
                 crops.found,
@@ -374,7 +373,8 @@ def levers(skeleton: Skeleton) -> Array:
             rows += [1.0, 1.0, 1.0, float(np.sqrt((offset**2).sum() / skeleton.n_joints))]
     lever = np.array(rows)
     lever[3:6] = np.inf
-    lever = np.maximum(lever, _LEAST_LEVER * skeleton.length)
+    # a rotation about its own axis moves no joint of a straight animal
+    lever = np.maximum(lever, 0.05 * skeleton.length)
     lever[3:6] = 1.0
     return lever
 
@@ -449,7 +449,9 @@ def train_forests(
     headings = np.empty(len(image))
     unseen = ~in_bag.T[image]
     unseen |= ~unseen.any(axis=1, keepdims=True)  # all trees were grown on it: use all
-    kernels.locate_all(
+    in_parallel(
+        kernels.locate_all,
+        len(image),
         data.images.heights,
         data.images.crop_cameras,
         image,
@@ -475,8 +477,14 @@ def _grow_where(
     """Grow F1; also returns (T, n_images) bool, the images that each tree was grown on."""
     animals = np.flatnonzero(data.animal).astype(np.int32)
     points = np.empty((len(animals), plan.training_points, 3))
-    kernels.points_all(
-        data.images.heights, data.images.crop_cameras, animals, rng.random(len(animals)), points
+    in_parallel(
+        kernels.points_all,
+        len(animals),
+        data.images.heights,
+        data.images.crop_cameras,
+        animals,
+        rng.random(len(animals)),
+        points,
     )
     image = np.repeat(animals, plan.training_points)
     places = points.reshape(-1, 3)
@@ -495,7 +503,16 @@ def _samples(
     """Features from positions (n, 3) of images (n,), with offsets turned by headings (n,)."""
     n = len(image)
     views = np.empty((n, 1, VIEW), np.float32)
-    kernels.views_all(data.images.crop_cameras, image, places, headings, skeleton.length, views)
+    in_parallel(
+        kernels.views_all,
+        n,
+        data.images.crop_cameras,
+        image,
+        places,
+        headings,
+        skeleton.length,
+        views,
+    )
     return Samples(
         data.images.heights, image, np.ones(n, np.float32), views, np.zeros((n, 1), np.float32)
     )

@@ -39,7 +39,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.cascade import TrainingSet
 from liex_lab.estimation.training import ProgressCallback
-from liex_lab.runtime.processes import threads
+from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene.height_maps import HeightMaps, in_camera_frame
 
 if TYPE_CHECKING:
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-N_FRAME = 5  # numbers of a square, see `frames_of`
 _BATCH = 64
 
 
@@ -62,8 +61,8 @@ def frames_of(heights: NDArray[np.int16], crop_cameras: Array) -> Array:
         (n, 5): image pixel (u, v) of the square's centre, half the side in image pixels, the
         animal's mean depth, mm, and half the side in mm at that depth.
     """
-    frames = np.empty((len(crop_cameras), N_FRAME))
-    kernels.frames_all(heights, crop_cameras, frames)
+    frames = np.empty((len(crop_cameras), 5))
+    in_parallel(kernels.frames_all, len(frames), heights, crop_cameras, frames)
     return frames
 
 
@@ -81,7 +80,7 @@ def patches_of(
         (n, PATCH, PATCH) float32 brightness, 0 to 255; 0 outside the animal.
     """
     patches = np.empty((len(crop_cameras), kernels.PATCH, kernels.PATCH), np.float32)
-    kernels.patches_all(heights, crop_cameras, frames, patches)
+    in_parallel(kernels.patches_all, len(frames), heights, crop_cameras, frames, patches)
     return patches
 
 

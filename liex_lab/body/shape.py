@@ -258,9 +258,6 @@ def _numbers(value: Any, n: int) -> bool:
 # Sphere-set approximation of a body: spheres along its bones that move with its joints.
 
 
-_SPACING = 1.3  # radii between the middles of two balls
-
-
 @dataclass(frozen=True)
 class Spheres:
     """B spheres, each between two points that two joints carry. Lengths in mm at scale 1.
@@ -326,7 +323,8 @@ def _along(
         is_bone = (
             (int(a), int(b)) in bones and not np.any(at_a) and not np.any(at_b)
         )  # it begins at the end of another capsule
-        n = max(1, round(length / (_SPACING * 0.5 * (first + last))))
+        # 1.3 radii between the middles of two spheres
+        n = max(1, round(length / (1.3 * 0.5 * (first + last))))
         rows += [
             (a, b, at_a, at_b, s, first + s * (last - first))
             for s in np.arange(int(is_bone), n + 1) / n
@@ -348,10 +346,6 @@ def _tube(skeleton: Skeleton) -> tuple[NDArray[np.int64], Array, Array]:
 
 
 # Linear blend skinning of a user's own triangle mesh.
-
-
-_BONES = 2  # bones per vertex
-_SHARPNESS = 4  # exponent of the distance in a bone's weight
 
 
 @dataclass(frozen=True)
@@ -417,9 +411,10 @@ class MeshBody(Body):
             np.einsum("vbd,bd->vb", vertices[:, None] - start, bone) / length2, 0.0, 1.0
         )
         far = np.linalg.norm(vertices[:, None] - start - share[..., None] * bone, axis=-1)
-        n_bones = min(_BONES, len(ends))
+        # each vertex follows up to two bones
+        n_bones = min(2, len(ends))
         near = np.argsort(far, axis=1, kind="stable")[:, :n_bones]
-        pull = 1.0 / np.maximum(np.take_along_axis(far, near, axis=1), 1e-6) ** _SHARPNESS
+        pull = 1.0 / np.maximum(np.take_along_axis(far, near, axis=1), 1e-6) ** 4
         carrier = carriers[near]
         local = np.einsum(
             "vbji,vbj->vbi", home.rotation[carrier], vertices[:, None] - home.translation[carrier]

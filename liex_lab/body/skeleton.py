@@ -29,7 +29,6 @@ Array = NDArray[np.float64]
 AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the joint's own frame
 PRESETS = Path(__file__).parent / "presets"
 _JOINT_KEYS = {"name", "parent", "offset_mm", "rest_deg", "axes", "limits_deg"}
-_ROOT_DOF = 6
 # home length of the mouse: lengths that apply to every animal are stated for it
 REFERENCE_MM = 52.834
 VIEWS = ("floor", "camera")
@@ -257,7 +256,7 @@ class Skeleton:
     @property
     def dof(self) -> int:
         """Degrees of freedom: six for the base and one for each free axis of the other joints."""
-        return _ROOT_DOF + int(self.axes[1:].sum())
+        return 6 + int(self.axes[1:].sum())
 
     @cached_property
     def edges(self) -> list[tuple[int, int]]:
@@ -389,7 +388,6 @@ def _triple(value: Any, where: str) -> list[float]:
 
 
 _MOST_FACES = 4000
-_FEWEST_FACES = 4
 
 
 def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
@@ -428,7 +426,7 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
         mesh.remove_unreferenced_vertices()
     vertices = np.asarray(mesh.vertices) * unit_mm
     faces = np.asarray(mesh.triangles)
-    if len(faces) < _FEWEST_FACES or not np.isfinite(vertices).all():
+    if len(faces) < 4 or not np.isfinite(vertices).all():
         raise LiexError(
             f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} "
             f"contains {len(faces)} of them; export it as STL, OBJ or PLY"

@@ -30,7 +30,6 @@ Window = tuple[int, int, int, int]
 # distance of the silhouette's camera, in reaches of the body, and size of its image, px
 _FAR = 50.0
 _SILHOUETTE_PX = 400
-_FEW = 16  # bodies that one thread skins sooner than several
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,8 @@ class Surface:
             for factor in (pose.scale, pose.scale if girth is None else girth)
         )
         body = self.body.bare() if shape is None else shape
-        with threads(parallel and n > _FEW):
+        # one thread skins few bodies sooner than several do
+        with threads(parallel and n > 16):
             if isinstance(body, Capsules | MeshBody):
                 return body.vertices(rotations, joints, scale, across).reshape(*batch, -1, 3)
             assert isinstance(body, BodyShape)

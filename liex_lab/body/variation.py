@@ -24,7 +24,6 @@ Array = NDArray[np.float64]
 
 FAMILIES = ("train", "augmented", "wide", "other")
 _WILD_SHARE = 0.6
-_HULL_SHARE = 0.5  # of the wild ones
 
 
 def _check_family(family: str) -> None:
@@ -70,7 +69,7 @@ def draw_shapes(rng: np.random.Generator, skeleton: Skeleton, family: str, n: in
     else:
         width, height = _varied(rng, default, stations, wild[:, None])
     if family in ("augmented", "wide"):
-        free = wild & (rng.random(n) < _HULL_SHARE)
+        free = wild & (rng.random(n) < 0.5)
         hull_width, hull_height = _hulls(rng, default, stations, n)
         width = np.where(free[:, None], hull_width, width)
         height = np.where(free[:, None], hull_height, height)

@@ -70,13 +70,7 @@ SCENES_PROTOCOL = (
     "of the same animal. said: the problems that the session lists, or the sentence with which "
     "the run ended. exit_code: of the run."
 )
-IN_VIEW = 0.5  # at least this share of an animal is visible
-HIDDEN = 0.25  # at most this share
 FAR = 0.15  # of the spine: a larger error is wrong
-_FOUND_AGAIN = 0.12  # of the animal's length
-_LOST = 0.5  # of the animal's length: the error of a missing pose
-_Z90 = 1.645
-_BOOTSTRAP_SEED = 20170703
 
 
 def error_of(joints: Array, truth: Array) -> Array:
@@ -179,7 +173,7 @@ def interval95(
     groups = [error[posed & (recording == k)] for k in np.unique(recording[posed])]
     if len(groups) < 2:
         return None
-    rng = np.random.default_rng(_BOOTSTRAP_SEED)
+    rng = np.random.default_rng(20170703)
     drawn = [
         statistic(np.concatenate([groups[k] for k in rng.integers(len(groups), size=len(groups))]))
         for _ in range(n_draws)
@@ -246,7 +240,7 @@ class Followed:
     @property
     def inside(self) -> Mask:
         """(n, J, 3) bool, whether a joint coordinate lies within its 90 % interval."""
-        return np.asarray(np.abs(self.joints - self.truth) <= _Z90 * self.sd_mm)
+        return np.asarray(np.abs(self.joints - self.truth) <= 1.645 * self.sd_mm)
 
     @property
     def covered(self) -> Mask:
@@ -264,7 +258,7 @@ class Followed:
         for event in events:
             if event.kind == "hidden":
                 visible[event.start : event.stop] = False
-        return np.nan_to_num(self.error_mm, nan=_LOST * length_mm)[visible]
+        return np.nan_to_num(self.error_mm, nan=0.5 * length_mm)[visible]
 
     def recovery(self, events: Sequence[Event], length_mm: float) -> list[int]:
         """Frames from the end of each occlusion until the animal is found again.
@@ -276,7 +270,7 @@ class Followed:
         Returns:
             Counts; the rest of the sequence if the animal is not found.
         """
-        near = self.error_mm < _FOUND_AGAIN * length_mm
+        near = self.error_mm < 0.12 * length_mm
         found = []
         for event in events:
             if event.kind in ("hidden", "occluder") and event.stop < len(near):
@@ -399,8 +393,8 @@ class Tally:
             self.wrong += 0 if k in pairs.values() else trusted
         for t, truth in enumerate(truths if fits else ()):
             there = np.isfinite(truth.joints_camera).all(axis=(1, 2))
-            view = there & (truth.visible >= IN_VIEW)
-            hidden = there & (truth.visible <= HIDDEN)
+            view = there & (truth.visible >= 0.5)
+            hidden = there & (truth.visible <= 0.25)
             self.in_view += int(view.sum())
             self.hidden += int(hidden.sum())
             if t not in pairs:

@@ -26,8 +26,6 @@ from liex_lab.runtime.processes import in_parallel
 
 Array = NDArray[np.float64]
 
-_LAST_KIND = max(TWO_PROBES, ONE_PROBE, SCALAR)
-
 
 @dataclass(frozen=True)
 class Forest:
@@ -145,7 +143,7 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
         raise ValueError(f"a node names a leaf beyond the {len(leaves)} there are")
     tests = nodes[at, 3]
     kind = tests & 3
-    if kind.max(initial=0) > _LAST_KIND:
+    if kind.max(initial=0) > max(TWO_PROBES, ONE_PROBE, SCALAR):
         raise ValueError("a test is of an unknown kind")
     scalar = kind == SCALAR
     most = [tests.max(where=each, initial=-1) >> 2 for each in (~scalar, scalar)]

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from liex_lab.forests._kernels import (
@@ -30,6 +29,7 @@ from liex_lab.forests._kernels import (
 from liex_lab.forests.forest import Forest, Samples, predict
 from liex_lab.runtime.kernels import inner_kernel, kernel
 from liex_lab.runtime.memory import check_shapes
+from liex_lab.runtime.processes import in_parallel
 
 _N_THRESHOLDS = 20
 _TREES_A_STAGE = 2
@@ -147,7 +147,9 @@ def grow_forest(
     leaves = np.zeros((plan.n_trees, capacity + 1, labels.shape[1]), np.float32)
     counts = np.zeros((plan.n_trees, 2), np.int64)
     seeds = rng.integers(0, 2**63, plan.n_trees, dtype=np.uint64)
-    _grow_all(
+    in_parallel(
+        _grow_trees,
+        plan.n_trees,
         _SampleArrays(
             samples.heights,
             samples.image,
@@ -210,10 +212,10 @@ def boost_forest(
     return Forest.join(trees)
 
 
-@kernel(parallel=True)
-def _grow_all(samples, growth, order, starts, seeds, nodes, leaves, counts):
-    """Grow all trees in parallel: tree t on the samples order[starts[t] : starts[t + 1]]."""
-    for t in prange(seeds.size):
+@kernel(nogil=True)
+def _grow_trees(samples, growth, order, starts, seeds, nodes, leaves, counts, start, stop):
+    """Grow some trees: tree t on the samples order[starts[t] : starts[t + 1]]."""
+    for t in range(start, stop):
         _grow_tree(
             samples,
             growth,

@@ -368,9 +368,6 @@ PRESETS = {
     "raytrix-r5": (RAYTRIX_R5,),
 }
 
-# sizes of few kinds of camera; for others, no lens is unusual
-_DISTINCTIVE = ((640, 480), (512, 424), (320, 240), (640, 576))
-
 
 def preset(name: str, width: int, height: int) -> Camera:
     """The preset camera for images of a size.
@@ -428,11 +425,13 @@ def unusual_lens(camera: Camera) -> str:
         camera: as stated by the recording or the plan, for images without water.
     """
     size = (camera.width, camera.height)
+    # sizes of few kinds of camera; for others, no lens is unusual
     usual_px = {
         name: one.fx
         for name, cameras in PRESETS.items()
         for one in cameras
-        if (one.width, one.height) == size and size in _DISTINCTIVE
+        if (one.width, one.height) == size
+        and size in ((640, 480), (512, 424), (320, 240), (640, 576))
     }
     # specimens, and images mapped to another lens, differ by less
     if not usual_px or any(abs(camera.fx / fx - 1.0) <= 0.1 for fx in usual_px.values()):

@@ -410,7 +410,7 @@ def imported_ahead(*modules: str) -> Iterator[None]:
 
 @contextmanager
 def threads(parallel: bool) -> Iterator[None]:
-    """Within the block, `in_parallel` and numba's parallel loops use all threads or one.
+    """Within the block, `in_parallel` uses all threads or one.
 
     Args:
         parallel: whether to keep the current number of threads; False uses one.

@@ -9,7 +9,6 @@ depth images, `draw_hands` images and patches of hands.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
 from liex_lab.body._rasterizer_kernels import draw_projected, project
 from liex_lab.runtime.kernels import kernel
@@ -205,8 +204,29 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
 
 
 @kernel()
-def draw_parts(parts, i, rotation, translation, intrinsics, u0, v0, depth, what):
-    """Rasterise the objects that exist in image i, see `draw_onto`."""
+def _expose(
+    parts, i, rotation, translation, cameras, noises, state, forget, field, depth, what, out
+):
+    """Rasterise the objects that exist in image i onto its still scene, and let the sensor read it.
+
+    Args:
+        parts: tuple of `Part`.
+        i: the image.
+        rotation: (3, 3) from the parts' frame into the camera frame.
+        translation: (3,) likewise, mm.
+        cameras: `PatchCamera`.
+        noises: `SensorNoise`.
+        state: (1,) uint64, of the random numbers.
+        forget: whether pixels outside the whole image have no kind either.
+        field: (H, W) float32, overwritten.
+        depth: (H, W) float32 mm, changed in place.
+        what: (H, W) uint8 kinds, changed in place.
+        out: (H, W) uint16, output.
+    """
+    intrinsics = cameras.intrinsics[i]
+    size = cameras.size[i]
+    u0 = float(cameras.origin[i, 0])
+    v0 = float(cameras.origin[i, 1])
     for part in parts:
         if part.shown[i]:
             draw_onto(
@@ -221,168 +241,163 @@ def draw_parts(parts, i, rotation, translation, intrinsics, u0, v0, depth, what)
                 depth,
                 what,
             )
-
-
-@kernel()
-def _draw_window(parts, i, cameras, views, noises, depth_out, background_out):
-    """One training patch: still scene, its learned background, objects, noise."""
-    shape = depth_out.shape
-    intrinsics = cameras.intrinsics[i]
-    size = cameras.size[i]
-    origin = cameras.origin[i]
-    height = views.height[i]
-    sensor = noises.parameters[i]
-    table = noises.table
-    state = np.array([noises.seed[i]], np.uint64)
-    field = np.empty(shape, np.float32)
-    depth = np.empty(shape, np.float32)
-    what = np.empty(shape, np.uint8)
-    smooth_field(state, table, 24.0, field)
-    floor_and_wall(
-        origin[0],
-        origin[1],
-        size,
-        intrinsics,
-        views.R_arena_camera[i],
-        height,
-        views.wall[i],
-        field,
-        views.rough[i],
-        depth,
-        what,
-    )
-    smooth_field(state, table, 9.0, field)
-    for r in range(shape[0]):
-        for c in range(shape[1]):
-            # a background is learned from many frames: low noise, with small smooth errors
-            error = sensor[BACKGROUND] * (0.4 * field[r, c] + 0.3 * normal(state, table))
-            background_out[r, c] = (
-                int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
-            )
-    rotation = np.ascontiguousarray(views.R_arena_camera[i].T)
-    translation = -height * rotation[:, 2]
-    u0 = float(origin[0])
-    v0 = float(origin[1])
-    draw_parts(parts, i, rotation, translation, intrinsics, u0, v0, depth, what)
-    for r in range(shape[0]):
-        for c in range(shape[1]):
-            u = origin[0] + c
-            v = origin[1] + r
-            if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
+    for r in range(depth.shape[0]):
+        for c in range(depth.shape[1]):
+            if u0 + c < 0 or v0 + r < 0 or u0 + c >= size[0] or v0 + r >= size[1]:
                 depth[r, c] = 0.0
-    centre_u = intrinsics[2] - u0
-    centre_v = intrinsics[3] - v0
-    sense(depth, what, sensor, intrinsics[0], centre_u, centre_v, state, table, field, depth_out)
-
-
-@kernel(parallel=True)
-def draw_windows(animals, objects, cameras, views, noises, depth_out, background_out):
-    """Render n training patches and their learned backgrounds, one thread per patch.
-
-    Args:
-        animals: `Part` in the arena frame.
-        objects: `Part` likewise, objects next to them.
-        cameras: `PatchCamera`.
-        views: `ArenaView`.
-        noises: `SensorNoise`.
-        depth_out: (n, S, S) uint16 in steps of the sensor's unit, output, 0 = unread.
-        background_out: (n, S, S) uint16 likewise, the still scene as learned from many frames.
-    """
-    for i in prange(len(depth_out)):
-        parts = (animals, objects)  # a tuple of records cannot be passed to threads
-        _draw_window(parts, i, cameras, views, noises, depth_out[i], background_out[i])
-
-
-@kernel()
-def _draw_frame(still, parts, i, rotation, translation, intrinsics, noises, out):
-    """One full frame: the still scene, the objects, and the sensor."""
-    state = np.array([noises.seed[i]], np.uint64)
-    depth = still.copy()
-    what = np.where(still > 0, np.uint8(STILL), np.uint8(NOTHING))
-    draw_parts(parts, i, rotation, translation, intrinsics, 0.0, 0.0, depth, what)
+                what[r, c] = NOTHING if forget else what[r, c]
     sense(
         depth,
         what,
         noises.parameters[i],
         intrinsics[0],
-        intrinsics[2],
-        intrinsics[3],
+        intrinsics[2] - u0,
+        intrinsics[3] - v0,
         state,
         noises.table,
-        np.empty(depth.shape, np.float32),
+        field,
         out,
     )
 
 
-@kernel(parallel=True)
-def draw_frames(still, animals, objects, rotation, translation, intrinsics, noises, out):
-    """Render n full frames of one scene, one thread per frame.
+@kernel(nogil=True)
+def draw_windows(parts, cameras, views, noises, depth_out, background_out, start, stop):
+    """Render training patches and their learned backgrounds.
+
+    Args:
+        parts: tuple of `Part` in the arena frame.
+        cameras: `PatchCamera`.
+        views: `ArenaView`.
+        noises: `SensorNoise`.
+        depth_out: (n, S, S) uint16 in steps of the sensor's unit, output, 0 = unread.
+        background_out: (n, S, S) uint16 likewise, the still scene as learned from many frames.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
+    """
+    shape = depth_out.shape[1:]
+    table = noises.table
+    for i in range(start, stop):
+        sensor = noises.parameters[i]
+        state = np.array([noises.seed[i]], np.uint64)
+        field = np.empty(shape, np.float32)
+        depth = np.empty(shape, np.float32)
+        what = np.empty(shape, np.uint8)
+        smooth_field(state, table, 24.0, field)
+        floor_and_wall(
+            cameras.origin[i, 0],
+            cameras.origin[i, 1],
+            cameras.size[i],
+            cameras.intrinsics[i],
+            views.R_arena_camera[i],
+            views.height[i],
+            views.wall[i],
+            field,
+            views.rough[i],
+            depth,
+            what,
+        )
+        smooth_field(state, table, 9.0, field)
+        for r in range(shape[0]):
+            for c in range(shape[1]):
+                # a background is learned from many frames: low noise, with small smooth errors
+                error = sensor[BACKGROUND] * (0.4 * field[r, c] + 0.3 * normal(state, table))
+                background_out[i, r, c] = (
+                    int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
+                )
+        rotation = np.ascontiguousarray(views.R_arena_camera[i].T)
+        translation = -views.height[i] * rotation[:, 2]
+        _expose(
+            parts,
+            i,
+            rotation,
+            translation,
+            cameras,
+            noises,
+            state,
+            False,
+            field,
+            depth,
+            what,
+            depth_out[i],
+        )
+
+
+@kernel(nogil=True)
+def draw_frames(still, parts, rotation, translation, cameras, noises, out, start, stop):
+    """Render full frames of one scene.
 
     Args:
         still: (H, W) float32 mm, the ideal still scene, 0 = nothing.
-        animals: `Part` in the arena frame.
-        objects: `Part` likewise, all other moving objects.
+        parts: tuple of `Part` in the arena frame.
         rotation: (3, 3) of T_camera_arena.
         translation: (3,) of T_camera_arena, mm.
-        intrinsics: (4,) fx, fy, cx, cy, px.
+        cameras: `PatchCamera`, the whole image n times.
         noises: `SensorNoise`.
         out: (n, H, W) uint16 in steps of the sensor's unit, output, 0 = unread.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for i in prange(len(out)):
-        parts = (animals, objects)
-        _draw_frame(still, parts, i, rotation, translation, intrinsics, noises, out[i])
+    for i in range(start, stop):
+        state = np.array([noises.seed[i]], np.uint64)
+        what = np.where(still > 0, np.uint8(STILL), np.uint8(NOTHING))
+        field = np.empty(still.shape, np.float32)
+        _expose(
+            parts,
+            i,
+            rotation,
+            translation,
+            cameras,
+            noises,
+            state,
+            False,
+            field,
+            still.copy(),
+            what,
+            out[i],
+        )
 
 
-@kernel()
-def _draw_hand(parts, i, wall, cameras, noises, out):
-    """One depth image or patch (H, W) of a hand in front of the plane `wall` (4,)."""
-    shape = out.shape
-    intrinsics = cameras.intrinsics[i]
-    size = cameras.size[i]
-    origin = cameras.origin[i]
-    table = noises.table
-    state = np.array([noises.seed[i]], np.uint64)
-    field = np.empty(shape, np.float32)
-    depth = np.empty(shape, np.float32)
-    what = np.empty(shape, np.uint8)
-    smooth_field(state, table, 24.0, field)
-    for r in range(shape[0]):
-        for c in range(shape[1]):
-            inverse = wall[0] * (origin[0] + c) + wall[1] * (origin[1] + r) + wall[2]
-            there = inverse > 1.0 / 4500.0
-            depth[r, c] = 1.0 / inverse + wall[3] * field[r, c] if there else 0.0
-            what[r, c] = STILL if there else NOTHING
-    u0 = float(origin[0])
-    v0 = float(origin[1])
-    draw_parts(parts, i, np.eye(3), np.zeros(3), intrinsics, u0, v0, depth, what)
-    for r in range(shape[0]):
-        for c in range(shape[1]):
-            u = origin[0] + c
-            v = origin[1] + r
-            if u < 0 or v < 0 or u >= size[0] or v >= size[1]:
-                depth[r, c] = 0.0
-                what[r, c] = NOTHING
-    sensor = noises.parameters[i]
-    centre_u = intrinsics[2] - u0
-    centre_v = intrinsics[3] - v0
-    sense(depth, what, sensor, intrinsics[0], centre_u, centre_v, state, table, field, out)
-
-
-@kernel(parallel=True)
-def draw_hands(bodies, objects, arms, hands, walls, cameras, noises, out):
-    """Render n depth images or patches of hands, one thread per image.
+@kernel(nogil=True)
+def draw_hands(parts, walls, cameras, noises, out, start, stop):
+    """Render depth images or patches of hands.
 
     Args:
-        bodies: `Part` in the camera frame, behind the hands.
-        objects: `Part` likewise, objects next to them.
-        arms: `Part` likewise.
-        hands: `Part` likewise.
+        parts: tuple of `Part` in the camera frame: bodies behind the hands, objects next to them,
+            arms and hands.
         walls: (n, 4) a, b, c of 1 / z = a u + b v + c behind everything, and its unevenness, mm; c
             = 0: nothing in range.
         cameras: `PatchCamera`.
         noises: `SensorNoise`.
         out: (n, H, W) uint16 mm, output, 0 = unread.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for i in prange(len(out)):
-        parts = (bodies, objects, arms, hands)
-        _draw_hand(parts, i, walls[i], cameras, noises, out[i])
+    shape = out.shape[1:]
+    for i in range(start, stop):
+        wall = walls[i]
+        origin = cameras.origin[i]
+        state = np.array([noises.seed[i]], np.uint64)
+        field = np.empty(shape, np.float32)
+        depth = np.empty(shape, np.float32)
+        what = np.empty(shape, np.uint8)
+        smooth_field(state, noises.table, 24.0, field)
+        for r in range(shape[0]):
+            for c in range(shape[1]):
+                inverse = wall[0] * (origin[0] + c) + wall[1] * (origin[1] + r) + wall[2]
+                there = inverse > 1.0 / 4500.0
+                depth[r, c] = 1.0 / inverse + wall[3] * field[r, c] if there else 0.0
+                what[r, c] = STILL if there else NOTHING
+        _expose(
+            parts,
+            i,
+            np.eye(3),
+            np.zeros(3),
+            cameras,
+            noises,
+            state,
+            True,
+            field,
+            depth,
+            what,
+            out[i],
+        )

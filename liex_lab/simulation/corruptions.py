@@ -40,21 +40,7 @@ EVENTS = {
     "fast": (3, 0.4, 1.0),
     "dropped": (3, 0.1, 0.35),
 }
-_CALM_S = (0.1, 0.5)  # between two events
-_LONE_DROP = 0.02  # share of single dropped frames
-_FAST = (2, 3)  # range of the speed factor
-_FAINT_MM = (0.2, 0.4)  # of the animal's length: smaller heights are lost in the floor
-_FAINT_LOST = (0.4, 0.75)  # lost share of the readings of a floating animal
-_HOLE = (0.1, 0.26)  # radius, of the animal's length
 _CELL = 3  # side of the cells of dropout, px
-# an occluder: half its width, its initial distance and its length, over the animal's length
-_BAR_HALF = (0.12, 0.5)
-_BAR_FROM = 2.0
-_BAR_LONG = 2.5
-# an object next to a hand: its half sides and its distance, over the hand's length
-_HELD = (0.08, 0.3)
-_HELD_ASIDE = (0.1, 0.5)
-_AWAY = np.array([0.0, 0.0, 1e6])  # behind the camera
 
 TWO_FACES = joined_faces([SPHERE_TUBE] * (2 * N_PARTS))
 
@@ -106,8 +92,10 @@ def draw_script(
         if kind == "dropped":
             steps[at] += length
         events.append(Event(kind, at, stop))
-        at = stop + max(1, round(rng.uniform(*_CALM_S) / step_s))
-    alone = rng.random(n_frames) < _LONE_DROP
+        # calm between two events, s
+        at = stop + max(1, round(rng.uniform(0.1, 0.5) / step_s))
+    # some frames are dropped singly
+    alone = rng.random(n_frames) < 0.02
     alone[:2] = False
     return events, steps + alone
 
@@ -126,7 +114,7 @@ def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArra
     times = np.ones(n_frames, np.int64)
     for event in events:
         if event.kind == "fast":
-            times[event.start : event.stop] = rng.integers(_FAST[0], _FAST[1] + 1)
+            times[event.start : event.stop] = rng.integers(2, 4)
     return times
 
 
@@ -155,7 +143,8 @@ def draw_objects(
         (n, 2 V, 3) mm, arena frame: the occluder's vertices, then the second object's.
     """
     one = int(OBJECT_FACES.max()) + 1
-    objects = np.tile(eye + _AWAY, (len(joints), 2 * one, 1))
+    # behind the camera
+    objects = np.tile(eye + np.array([0.0, 0.0, 1e6]), (len(joints), 2 * one, 1))
     for event in events:
         span = slice(event.start, event.stop)
         if event.kind == "occluder":
@@ -174,10 +163,11 @@ def _passing(
     share = (eye[2] - height) / (eye[2] - target[2])  # on the ray from the camera to the animal
     over = eye[:2] + (target[:2] - eye[:2]) * share
     direction = rng.uniform(-np.pi, np.pi)
-    half = rng.uniform(*_BAR_HALF) * length_mm * share
-    sides = [half, _BAR_LONG * length_mm * share, 0.1 * length_mm]
+    # half width, length and initial distance over the animal's length
+    half = rng.uniform(0.12, 0.5) * length_mm * share
+    sides = [half, 2.5 * length_mm * share, 0.1 * length_mm]
     mesh = mesh_of([(np.zeros(3), sides, direction, 8.0)])
-    s = np.linspace(-1.0, 1.0, len(joints))[:, None] * _BAR_FROM * length_mm * share
+    s = np.linspace(-1.0, 1.0, len(joints))[:, None] * 2.0 * length_mm * share
     along = s * np.array([np.cos(direction), np.sin(direction)])
     place = np.concatenate([over + along, np.full((len(s), 1), height)], axis=1)
     return mesh + place[:, None]
@@ -235,13 +225,15 @@ def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Ar
     Returns:
         (n, V, 3) mm, arena frame, the same in every frame.
     """
-    radii = rng.uniform(*_HELD, 3) * length_mm
+    # half sides over the hand's length
+    radii = rng.uniform(0.08, 0.3, 3) * length_mm
     power = rng.choice([2.0, 8.0])
     mesh = mesh_of([(np.zeros(3), radii, rng.uniform(-np.pi, np.pi), power)])
     direction = rng.uniform(-np.pi, np.pi)
     toward = np.array([np.cos(direction), np.sin(direction)])
     reach = (joints[..., :2] @ toward).max() + np.hypot(*radii[:2])
-    reach += rng.uniform(*_HELD_ASIDE) * length_mm
+    # distance over the hand's length
+    reach += rng.uniform(0.1, 0.5) * length_mm
     middle = joints.mean(axis=(0, 1))
     place = np.array([*(middle[:2] + (reach - middle[:2] @ toward) * toward), middle[2]])
     return np.broadcast_to(mesh + place, (len(joints), *mesh.shape))
@@ -291,14 +283,17 @@ class Loss:
         for event in events:
             span = slice(event.start, event.stop)
             if event.kind == "faint" and floats:
-                dropout[span] = rng.uniform(*_FAINT_LOST)
+                # lost share of the readings of a floating animal
+                dropout[span] = rng.uniform(0.4, 0.75)
             elif event.kind == "faint":
-                faint[span] = rng.uniform(*_FAINT_MM) * length_mm
+                # smaller heights are lost in the floor
+                faint[span] = rng.uniform(0.2, 0.4) * length_mm
             elif event.kind == "holes":
                 for i in range(event.start, event.stop):
                     centres = joints[i, rng.integers(joints.shape[1], size=int(rng.integers(2, 5)))]
                     centres = centres + rng.normal(0.0, 0.1 * length_mm, centres.shape)
-                    share = rng.uniform(*_HOLE, (len(centres), 1))
+                    # radius over the animal's length
+                    share = rng.uniform(0.1, 0.26, (len(centres), 1))
                     px = camera.fx / centres[:, 2:] * share * length_mm
                     discs[i] = np.concatenate([camera.project(centres), px], axis=1)
         return Loss(tuple(discs), faint, dropout)

@@ -58,21 +58,12 @@ _STRETCHES = {
     _REACH: (2, 0.4, 1.2, (0.0, 0.4)),
 }
 _BLEND_S = 0.12  # time constant of the blend between postures
-_STRIDE_HZ_PER_SPINE = 1.6
 
 # durations of beating, and of gliding or resting in between
-_BOUT_S = (0.15, 0.6)
-_REST_S = (0.1, 1.2)
 _GLIDE_S = 0.35  # time constant of a glide's speed
 _LENGTHS_S = (1.0, 5.0)  # speed that a bout reaches
-_BEAT_HZ = (4.0, 9.0)
 # share of bouts that begin with a turn, which lasts _TURN_S
-_TURN_SHARE = 0.35
-_TURN_RAD_S = (4.0, 16.0)
-_TURN_S = 0.14
 _BEND_PER_TURN = 0.55  # degrees per joint for each rad/s of turning
-_CLIMB_RAD = np.radians(25.0)
-_CHANGE_S = 0.5  # mean duration of a posture of an animal of any kind
 
 
 def moving_session(
@@ -176,7 +167,7 @@ def walk(
     posture = _flow(rng, skeleton, body, kinds)
     position, heading = (path or free_path)(rng, scene, spine_mm, spines_per_s * spine_mm)
     # the trunk sways with the stride
-    phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * _STRIDE_HZ_PER_SPINE) / _RATE_HZ
+    phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * 1.6) / _RATE_HZ
     posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [
         1.0,
         -0.5,
@@ -304,7 +295,7 @@ def _swim(
         smoothed(rng.normal(0.0, 0.8, (n_frames, 4)), 6.0),
     )
     size = np.full(n_frames, length / skeleton.length)
-    pitch = _CLIMB_RAD * np.tanh(smoothed(rng.normal(0.0, 6.0, n_frames), 25.0))
+    pitch = np.radians(25.0) * np.tanh(smoothed(rng.normal(0.0, 6.0, n_frames), 25.0))
     roll = np.radians(smoothed(rng.normal(0.0, 12.0, n_frames), 8.0))
     level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
     low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
@@ -329,7 +320,8 @@ def _roam(
     skeleton = species.skeleton
     step_s = species.frame_ns * 1e-9
     size = np.full(n_frames, length / skeleton.length)
-    slow = _CHANGE_S / step_s
+    # mean number of frames of a posture
+    slow = 0.5 / step_s
     starts = np.where(rng.random(n_frames) < 1.0 / slow, np.arange(n_frames), 0)
     drawn = draw_angles(rng, skeleton, n_frames)[np.maximum.accumulate(starts)]
     angles = smoothed(drawn.reshape(n_frames, -1), 0.4 * slow).reshape(drawn.shape)
@@ -362,16 +354,19 @@ def _swim_script(
     pace = 0.0
     while at < n:
         reached = rng.uniform(*_LENGTHS_S)
-        beats = rng.uniform(*_BEAT_HZ)
-        beating, resting = (max(2, int(rng.uniform(*span) / step_s)) for span in (_BOUT_S, _REST_S))
+        beats = rng.uniform(4.0, 9.0)
+        beating, resting = (
+            max(2, int(rng.uniform(*span) / step_s)) for span in ((0.15, 0.6), (0.1, 1.2))
+        )
         stop = min(at + beating, n)
         pace = max(reached, pace)
         speed[at:stop] = pace
         amplitude[at:stop] = rng.uniform(1.5, 5.0) * np.sqrt(pace / _LENGTHS_S[1])
         rate[at:stop] = beats
-        if rng.random() < _TURN_SHARE:
-            brief = min(at + max(2, int(_TURN_S / step_s)), n)
-            turning[at:brief] = rng.choice([-1.0, 1.0]) * rng.uniform(*_TURN_RAD_S)
+        # share of bouts that begin with a turn
+        if rng.random() < 0.35:
+            brief = min(at + max(2, int(0.14 / step_s)), n)
+            turning[at:brief] = rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 16.0)
         glide = np.arange(max(0, min(resting, n - stop)))
         speed[stop : stop + resting] = pace * np.exp(-(glide + 1) * step_s / _GLIDE_S)
         pace *= float(np.exp(-resting * step_s / _GLIDE_S))

@@ -17,7 +17,6 @@ joint's position between its limits (`draw_angles`).
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import chain_arc, spine_frame
@@ -26,6 +25,7 @@ from liex_lab.body.shape import Body, BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.kernels import kernel
+from liex_lab.runtime.processes import in_parallel
 
 Array = NDArray[np.float64]
 
@@ -34,8 +34,6 @@ KINDS = ("walk", "curl", "rear", "hunch", "reach")
 SHARES = (0.42, 0.17, 0.17, 0.10, 0.14)
 STRETCH = (0.93, 1.07)  # of the spine, from frame to frame
 SIZE_RANGE = (0.9, 1.1)  # of animals, over the skeleton's own size
-_REAR_PART = 0.35  # rear part of the trunk that supports a reared animal
-_MAX_GAP_MM = 3.0  # between the floor and the lowest point of the body
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def sample_postures(
     n = len(kinds)
     posture = draw_postures(rng, skeleton, kinds, shape)
     heading = rng.uniform(-np.pi, np.pi, n)
-    return stand(skeleton, posture, heading, size, shape, rng.uniform(0.0, _MAX_GAP_MM, n))
+    return stand(skeleton, posture, heading, size, shape, rng.uniform(0.0, 3.0, n))
 
 
 def draw_postures(
@@ -195,14 +193,17 @@ def stand(
     girth = size / np.sqrt(posture.stretch)
     stations = np.asarray(skeleton.surface["stations"], float)
     elevation = posture.elevation[:, 0].copy()
-    rear = stations <= _REAR_PART
+    # the rear part of the trunk supports a reared animal
+    rear = stations <= 0.35
     pose = Pose.home(skeleton, len(size))
     for _ in range(6):
         rotation = root_rotation(heading, elevation, posture.roll)
         pose = Pose(SE3(rotation, np.zeros((len(size), 3))), angles, scale)
         frames = pose.frames(skeleton)
         lowest = np.empty((len(size), len(stations)))
-        _lowest_points(
+        in_parallel(
+            _lowest_points,
+            len(size),
             frames.translation,
             frames.rotation,
             girth,
@@ -240,8 +241,8 @@ def root_rotation(heading: Array, elevation: Array, roll: Array) -> Array:
     return turn @ rise @ so3.exp(np.stack([roll, zero, zero], axis=-1))
 
 
-@kernel(parallel=True)
-def _lowest_points(joints, rotations, girth, stations, half_width, half_height, out):
+@kernel(nogil=True)
+def _lowest_points(joints, rotations, girth, stations, half_width, half_height, out, start, stop):
     """Fill out (n, R) with the lowest point of the trunk's ellipse at every station, mm.
 
     Args:
@@ -252,8 +253,10 @@ def _lowest_points(joints, rotations, girth, stations, half_width, half_height, 
         half_width: (n, R) mm.
         half_height: (n, R) mm.
         out: (n, R) output, mm.
+        start: first item to process, see `in_parallel`.
+        stop: the item after the last.
     """
-    for i in prange(len(joints)):
+    for i in range(start, stop):
         arc = np.empty(joints.shape[1])
         frame = np.empty((4, 3))
         chain_arc(joints[i], arc)
@@ -405,7 +408,6 @@ def clearance(skeleton: Skeleton, pose: Pose, shape: Body, size: Array) -> tuple
 
 
 _LIKE_NEXT = 0.75  # correlation of a joint's bend with its parent's
-_UNLIMITED_RAD = np.radians(100.0)  # an axis with a wider range counts as unlimited
 _USUAL_RAD = np.radians(45.0)  # and turns by this much
 
 
@@ -423,7 +425,8 @@ def draw_angles(rng: np.random.Generator, skeleton: Skeleton, n: int) -> Array:
     from scipy.special import ndtr
 
     low, high = np.moveaxis(skeleton.limits, -1, 0)
-    wide = high - low > 2.0 * _UNLIMITED_RAD
+    # a wide range counts as unlimited
+    wide = high - low > 2.0 * np.radians(100.0)
     low = np.where(wide, -_USUAL_RAD, low)
     high = np.where(wide, _USUAL_RAD, high)
     bent = rng.beta(1.2, 1.0, (n, 1, 1))  # deviation of this body from its home pose

@@ -27,6 +27,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.memory import Rows
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.floor import Floor
 from liex_lab.simulation import _render_kernels as render_kernels
 from liex_lab.simulation._sensor_kernels import ANIMAL, NORMAL, OBJECT, UNIT
@@ -169,10 +170,17 @@ class TrueRecording(Recording):
             ]
 
 
+def whole_images(camera: Camera, n: int) -> render_kernels.PatchCamera:
+    """The camera of n whole images."""
+    size = np.array([camera.width, camera.height])
+    return render_kernels.PatchCamera(
+        np.tile(camera.intrinsics, (n, 1)), np.tile(size, (n, 1)), np.zeros((n, 2), np.int64)
+    )
+
+
 def render_frames(
     still: NDArray[np.float32],
-    animals: render_kernels.Part,
-    objects: render_kernels.Part,
+    parts: tuple[render_kernels.Part, ...],
     camera: Camera,
     T_arena_camera: SE3,
     parameters: Array,
@@ -182,8 +190,7 @@ def render_frames(
 
     Args:
         still: (H, W) mm, the ideal still scene, 0 for nothing.
-        animals: their meshes, arena frame.
-        objects: those of all other moving objects.
+        parts: the moving objects, arena frame.
         camera: the camera.
         T_arena_camera: its pose.
         parameters: (n, N_PARAMETERS) of the sensor.
@@ -194,13 +201,14 @@ def render_frames(
     """
     out = np.empty((len(seeds), camera.height, camera.width), np.uint16)
     T_camera_arena = T_arena_camera.inverse()
-    render_kernels.draw_frames(
+    in_parallel(
+        render_kernels.draw_frames,
+        len(seeds),
         still,
-        animals,
-        objects,
+        parts,
         np.ascontiguousarray(T_camera_arena.rotation),
         T_camera_arena.translation,
-        camera.intrinsics,
+        whole_images(camera, len(seeds)),
         render_kernels.SensorNoise(parameters, seeds, NORMAL),
         out,
     )
@@ -260,8 +268,10 @@ class SyntheticSession(TrueRecording):
         animal = self.surface.vertices(some.pose, some.shape, some.girth, some.bends)
         return render_frames(
             self.scene.still,
-            render_kernels.part_of(animal, self.surface.faces, ANIMAL),
-            render_kernels.part_of(some.objects, some.object_faces, OBJECT, some.shown),
+            (
+                render_kernels.part_of(animal, self.surface.faces, ANIMAL),
+                render_kernels.part_of(some.objects, some.object_faces, OBJECT, some.shown),
+            ),
             self.scene.camera,
             self.scene.T_arena_camera,
             some.parameters,
@@ -312,7 +322,7 @@ class SyntheticSession(TrueRecording):
         shape = species.shapes(rng, family, 1)
         size = np.full(n_frames, spine / home)
         camera_mm = np.full(n_frames, scene.T_arena_camera.translation[2])
-        pose, girth, _ = species.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
+        pose, girth = species.postures(rng, size, shape[0].broadcast(n_frames), camera_mm)
         contents = assemble(
             rng,
             scene,

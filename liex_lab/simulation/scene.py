@@ -191,9 +191,6 @@ def draw_object(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
 
 ROUND = "round"
 BOX = "box"
-_EDGE_PX = 6.0  # minimum distance of an animal from the image border
-_WALL_MM = 3.0  # and of its trunk from walls
-_CLUTTER_MM = 12.0  # and from clutter
 _TRIES = 64
 
 
@@ -415,21 +412,20 @@ class SimulatedScene:
         reach = float(self.half.max()) if self.wall_mm > 0 else 0.9 * float(self.half.max())
         aim = self.centre + rng.uniform(-reach, reach, (n, _TRIES, 2))
         points = outline[:, None] - middle[:, None, None] + aim[:, :, None]
-        wall_clearance = self.wall_clearance(points).min(axis=2) - _WALL_MM
+        wall_clearance = self.wall_clearance(points).min(axis=2) - 3.0
         T_camera_arena = self.T_arena_camera.inverse()
         c = self.camera
         for height in (np.zeros(n) if bottoms is None else bottoms, tops):
             above = np.broadcast_to(height[:, None, None, None], (*points.shape[:-1], 1))
             uv = c.project(T_camera_arena @ np.concatenate([points, above], axis=-1))
             border = (
-                np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min(axis=(2, 3))
-                - _EDGE_PX
+                np.minimum(uv, np.array([c.width - 1, c.height - 1]) - uv).min(axis=(2, 3)) - 6.0
             )
             wall_clearance = np.minimum(wall_clearance, border)
         if len(self.clutter):
             gap = (
                 np.linalg.norm(points[:, :, :, None] - self.clutter[::7], axis=-1).min(axis=(2, 3))
-                - _CLUTTER_MM
+                - 12.0
             )
             wall_clearance = np.minimum(wall_clearance, gap)
         # the first free position, else the one with the largest clearance

@@ -7,7 +7,6 @@ is the mouse, `FishSpecies` the zebrafish, `GenericSpecies` any animal with a sk
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,20 +198,6 @@ def unseen(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
     return tuple(sensor for kind in kinds for sensor in _UNSEEN[kind])
 
 
-class Postures(NamedTuple):
-    """Poses of n animals, drawn from a prior.
-
-    Attributes:
-        pose: (n) arena frame, base above the origin.
-        girth: (n,) factor of all lengths across the bodies.
-        kind: (n,) int64, index into the species' kinds of posture.
-    """
-
-    pose: Pose
-    girth: Array
-    kind: NDArray[np.int64]
-
-
 @dataclass(frozen=True)
 class Species:
     """An animal as used by the renderer; everything is drawn from the given generator.
@@ -250,7 +235,7 @@ class Species:
 
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
-    ) -> Postures:
+    ) -> tuple[Pose, Array]:
         """A posture for each of n animals, on or above the floor.
 
         Args:
@@ -288,13 +273,13 @@ class MouseSpecies(Species):
 
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
-    ) -> Postures:
+    ) -> tuple[Pose, Array]:
         """Mice that walk, curl up, rear, hunch and reach, with the frequencies of
         `pose_prior.SHARES`; kinds are indices into `pose_prior.KINDS`.
         """
         assert isinstance(shape, BodyShape)
         kinds = rng.choice(len(KINDS), len(size), p=SHARES)
-        return Postures(*sample_postures(rng, self.skeleton, size, shape, kinds), kinds)
+        return sample_postures(rng, self.skeleton, size, shape, kinds)
 
     def bends(self, rng: np.random.Generator, n: int) -> Array:
         """Bends of the tails (n, TAIL_RINGS), rad."""
@@ -310,7 +295,6 @@ TANK = SceneSpec(
     scale=0.3,
 )
 NEAREST_MM = 180.0  # of a fish to the camera: nearer, a large one does not fit in the image
-_FLOOR_SHARE = 0.12  # share of fish just above the floor
 
 
 @dataclass(frozen=True)
@@ -327,7 +311,7 @@ class FishSpecies(Species):
 
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
-    ) -> Postures:
+    ) -> tuple[Pose, Array]:
         """Fish that glide, scoot and turn, mostly level, at any height above the floor, at least
         NEAREST_MM from the camera; kinds are indices into `pose_prior.FISH_KINDS`.
         """
@@ -340,16 +324,14 @@ class FishSpecies(Species):
         pose = hung(self.skeleton, draw_bends(rng, self.skeleton, kind), rotation, size)
         low, high = clearance(self.skeleton, pose, shape, size)
         headroom = np.maximum(camera_mm - NEAREST_MM - high, low + 1.0)
-        at = np.where(rng.random(n) < _FLOOR_SHARE, rng.uniform(0.0, 0.06, n), rng.random(n))
+        # some are just above the floor
+        at = np.where(rng.random(n) < 0.12, rng.uniform(0.0, 0.06, n), rng.random(n))
         pose.root.translation[:, 2] += low + at * (headroom - low) + rng.uniform(0.5, 2.0, n)
-        return Postures(pose, size, kind)
+        return pose, size
 
 
-_SMALL_MM = 35.0  # a shorter animal uses a close-range camera
 # tilts from which the resting orientation on the floor is chosen
 _TILTS = 8
-_TILT_RAD = 0.35
-_REARED_SHARE = 0.15  # share of animals that do not lie as low as possible
 NEAR_SHARE = 0.55  # of the camera's height: upper limit of floating animals
 
 
@@ -366,7 +348,8 @@ class GenericSpecies(Species):
         """The species of a skeleton: visible by the Raytrix R5 below 35 mm of length, in a scene in
         which the whole animal is visible from anywhere, at a sufficient size.
         """
-        sensors = (RAYTRIX_R5_SENSOR,) if skeleton.length < _SMALL_MM else SENSORS
+        # a short animal uses a close-range camera
+        sensors = (RAYTRIX_R5_SENSOR,) if skeleton.length < 35.0 else SENSORS
         scale = float(np.clip(skeleton.relative_size, 0.3, 2.0))
         # large in the image, with space to move, and not below the cameras' minimum distance
         least = ARENA.camera_mm[0] if sensors == SENSORS else 230.0
@@ -397,7 +380,7 @@ class GenericSpecies(Species):
 
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
-    ) -> Postures:
+    ) -> tuple[Pose, Array]:
         """Postures within the joints' limits, smooth along the chains."""
         n = len(size)
         angles = draw_angles(rng, self.skeleton, n)
@@ -410,11 +393,11 @@ class GenericSpecies(Species):
             low, high = self.extent(pose, shape, size)
             headroom = np.maximum(NEAR_SHARE * camera_mm - high, -low + 1.0)
             pose.root.translation[:, 2] += -low + rng.random(n) * (headroom + low)
-            return Postures(pose, size, np.zeros(n, np.int64))
+            return pose, size
         pose = self._fallen(rng, angles, heading, size)
         low, _ = self.extent(pose, shape, size)
         pose.root.translation[:, 2] += rng.uniform(0.0, 2.0, n) * self.setting.scale - low
-        return Postures(pose, size, np.zeros(n, np.int64))
+        return pose, size
 
     def extent(self, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:
         """Lowest and highest points (n,) mm of the bodies."""
@@ -424,7 +407,7 @@ class GenericSpecies(Species):
     def _fallen(self, rng: np.random.Generator, angles: Array, heading: Array, size: Array) -> Pose:
         """The lowest of several random tilts, as under gravity; sometimes any of them."""
         n = len(size)
-        tilts = rng.normal(0.0, _TILT_RAD, (_TILTS, 2, n))
+        tilts = rng.normal(0.0, 0.35, (_TILTS, 2, n))
         tilts[0] = 0.0
         poses = [
             centred(self.skeleton, angles, root_rotation(heading, t[0], t[1]), size) for t in tilts
@@ -434,5 +417,6 @@ class GenericSpecies(Species):
             z = pose.joints(self.skeleton)[..., 2]
             height.append(z.mean(axis=1) - z.min(axis=1))
         best = np.argmin(height, axis=0)
-        best = np.where(rng.random(n) < _REARED_SHARE, rng.integers(_TILTS, size=n), best)
+        # not all lie as low as possible
+        best = np.where(rng.random(n) < 0.15, rng.integers(_TILTS, size=n), best)
         return Pose.join(poses)[best * n + np.arange(n)]

@@ -350,8 +350,7 @@ def _postures(skeleton: Skeleton) -> Bodies:
     species = MouseSpecies(skeleton)
     shape = species.shapes(rng, "train", n)
     camera_mm = np.full(n, np.mean(species.setting.camera_mm))
-    drawn = species.postures(rng, rng.uniform(*species.sizes, n), shape, camera_mm)
-    return drawn.pose, drawn.girth, shape
+    return *species.postures(rng, rng.uniform(*species.sizes, n), shape, camera_mm), shape
 
 
 def _height_of(real: PointMotion, skeleton: Skeleton, bodies: Bodies, along: Array) -> float:

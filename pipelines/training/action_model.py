@@ -39,11 +39,12 @@ from liex_lab.simulation.agents import mouse as mouse_acts
 from liex_lab.simulation.agents.agent import (
     STEP_S,
     ActedMotion,
-    CameraPath,
     Individual,
+    draw_camera,
     render_agent,
 )
 from liex_lab.simulation.species import FishSpecies, MouseSpecies
+from liex_lab.simulation.training_patches import Views
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Subject
@@ -212,7 +213,7 @@ def act(
     if scenario.filmed_s:
         n = int(np.searchsorted(rows * STEP_S, scenario.filmed_s))
     times = np.round(rows[:n] * STEP_S * 1e9).astype(np.int64)
-    whole = Camera(*camera.intrinsics, *(int(x) for x in camera.size_px))
+    whole = Camera(*camera.intrinsics[0], *(int(x) for x in camera.size_px[0]))
     return AgentTrack(
         tracker.observe(rendered(rng, stage, slice(n), window_px), times, size),
         tracker.subject(whole, sample.floor(0).T_arena_camera, size),
@@ -231,7 +232,7 @@ Staged = tuple[
     Array,
     Array | None,
     FishSpecies | MouseSpecies,
-    CameraPath,
+    Views,
     BodyShape,
     Array,
 ]
@@ -274,7 +275,7 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
     motion = actor.cut(rng, scenario.word) if scenario.word else actor.uncut(rng, scenario.seconds)
     rows = motion.at(scenario.rate_hz)
     pose = fish_acts.fish_poses(rng, species, motion, rows, fish.size)
-    camera = CameraPath.draw(rng, species, species.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
+    camera = draw_camera(rng, species, species.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
     girth, wall_mm = np.full(len(rows), fish.size), np.full(len(rows), np.nan)
     return motion, rows, pose, girth, None, species, camera, shape, wall_mm
 
@@ -292,7 +293,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     pose, girth = mouse_acts.mouse_poses(rng, species, motion, rows, mouse.size, shape)
     middle = pose.joints(species.skeleton)[..., :2].mean(axis=1)
     sensor = species.sensors[int(rng.integers(len(species.sensors)))]
-    camera = CameraPath.draw(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
+    camera = draw_camera(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
     wall_mm = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
     # in some training recordings the walls are unknown
     if not scenario.novel and rng.random() >= 0.75:

@@ -11,7 +11,6 @@ is deterministic.
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numba
 import numpy as np
@@ -121,14 +120,17 @@ def mini_sessions(
     for number in range(n_blocks):
         progress(number, n_blocks, f"rendering animals of the family '{family}'")
         spine_mm, window_px = recipe.sizes[number % len(recipe.sizes)]
-        drawn: dict[str, Any] = {
-            "family": family,
-            "degraded_share": recipe.degraded_share,
-            "spine_mm": spine_mm or None,
-            "per_session": PER_SESSION,
-        }
-        (windows,) = world.training_blocks(seed, 1, first=number, window_px=window_px, **drawn)
-        bodies = training_patches.drawn_bodies(seed, number, world.species, **drawn)
+        (windows,) = world.training_blocks(
+            seed,
+            1,
+            first=number,
+            window_px=window_px,
+            family=family,
+            degraded_share=recipe.degraded_share,
+            spine_mm=spine_mm or None,
+            per_session=PER_SESSION,
+        )
+        bodies = windows.body[::PER_SESSION]
         assert isinstance(bodies, BodyShape)
         yield from _measured(estimator, windows, bodies, np.random.default_rng([seed, number, 2]))
 

@@ -6,10 +6,8 @@ import pytest
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import open_recording
 from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
-from liex_lab.simulation.scenes.places import box, joined, look_down, render_still
-from liex_lab.simulation.scenes.stage import PRESENCES, SceneRecording, TrueScene, timing_of
+from liex_lab.simulation.scenes.stage import SceneRecording, TrueScene, timing_of
 from liex_lab.simulation.species import KINECT_V2_SENSOR, PRIMESENSE_QVGA_SENSOR
-from liex_lab.simulation.training_patches import PER_SESSION, training_windows
 
 SEED = 41
 N = 12
@@ -30,7 +28,7 @@ def heights(recording: TrueScene, frame: int) -> np.ndarray:
     return np.asarray(np.where(depth > 0, z, np.nan))
 
 
-@pytest.mark.parametrize("name", ["plain", "bedding", "glossy", "tether", "drift", "mirrored-hand"])
+@pytest.mark.parametrize("name", ["bedding", "tether", "drift", "mirrored-hand"])
 def test_a_scene_is_the_same_whenever_and_in_whatever_order_it_is_read(name: str) -> None:
     sensor = KINECT_V2_SENSOR if name == "mirrored-hand" else PRIMESENSE_QVGA_SENSOR
     n = 3 if name == "mirrored-hand" else 14  # epochs of bedding and reflections are 12 frames
@@ -43,7 +41,17 @@ def test_a_scene_is_the_same_whenever_and_in_whatever_order_it_is_read(name: str
     )
 
 
-@pytest.mark.parametrize("name", [name for name, (plan, _) in SCENES.items() if plan == "mouse"])
+QUICK = ("plain", "late", "object", "house", "cage", "glossy", "bedding", "two-arenas")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in QUICK else pytest.mark.nightly)
+        for name, (plan, _) in SCENES.items()
+        if plan == "mouse"
+    ],
+)
 def test_the_animals_stand_where_the_truth_says(name: str) -> None:
     # long enough for a hand that brings an animal to be gone
     n = 30 if name in ("late", "leaves", "object", "object-out") else 4
@@ -55,6 +63,11 @@ def test_the_animals_stand_where_the_truth_says(name: str) -> None:
         uv = recording.camera.project(animal.joints_camera[frame]).round().astype(int)
         back = heights(recording, frame)[uv[1:4, 1], uv[1:4, 0]]
         assert np.nanmedian(back) > 8.0, "the trunk stands above the floor where the joints are"
+    if name == "late":
+        (animal,) = recording.animals
+        assert np.isnan(animal.joints_camera[:20]).all()
+        assert np.isfinite(animal.joints_camera[20:]).all()
+        assert not animal.visible[:20].any()
 
 
 def test_scenes_of_one_seed_have_the_same_animal() -> None:
@@ -88,6 +101,7 @@ def test_bedding_changes_where_the_animal_walks_and_lifts_it() -> None:
     assert (rump - level).min() > 0.5
 
 
+@pytest.mark.nightly
 def test_a_mouse_in_its_house_is_hidden() -> None:
     recording = mice("house", 120)
     seen = recording.animals[0].visible
@@ -117,27 +131,24 @@ def test_a_sensor_that_warms_up_reads_more_and_more() -> None:
     np.testing.assert_array_equal(drifting.depths(0, 1), steady.depths(0, 1))
 
 
-@pytest.mark.parametrize("presence", PRESENCES)
-def test_animals_are_there_and_move_as_long_as_they_should(presence: str) -> None:
+@pytest.mark.parametrize(
+    ("presence", "share", "rest"),
+    [
+        ("always", 1.0, 0.0),
+        ("asleep", 1.0, 0.78),
+        ("still", 1.0, 1.0),
+        ("late", 1 / 3, 0.0),
+        ("leaves", 0.45, 0.0),
+        ("never", 0.0, 0.0),
+    ],
+)
+def test_animals_are_there_and_move_as_long_as_they_should(
+    presence: str, share: float, rest: float
+) -> None:
     moments, there = timing_of(presence, 300)
     resting = (np.diff(moments) == 0)[there[1:]].mean() if there.any() else 0.0
-    share, rest = {
-        "always": (1.0, 0.0),
-        "asleep": (1.0, 0.78),
-        "still": (1.0, 1.0),
-        "late": (1 / 3, 0.0),
-        "leaves": (0.45, 0.0),
-        "never": (0.0, 0.0),
-    }[presence]
     assert there.mean() == pytest.approx(share, abs=0.01)
     assert resting == pytest.approx(rest, abs=0.02)
-
-
-def test_an_animal_that_comes_late_has_no_truth_before() -> None:
-    animal = mice("late", 30).animals[0]
-    assert np.isnan(animal.joints_camera[:20]).all()
-    assert np.isfinite(animal.joints_camera[20:]).all()
-    assert not animal.visible[:20].any()
 
 
 def test_two_animals_keep_apart_and_an_empty_arena_has_none() -> None:
@@ -157,31 +168,6 @@ def test_a_mirrored_hand_is_the_hand_with_left_and_right_exchanged() -> None:
     theirs = hand.camera.project(hand.joints_camera)
     np.testing.assert_allclose(ours[..., 0], hand.width - 1 - theirs[..., 0])
     np.testing.assert_allclose(ours[..., 1], theirs[..., 1])
-
-
-def test_a_still_picture_shows_the_nearest_thing() -> None:
-    T = look_down(600.0, 0.0, 0.0)
-    camera = PRIMESENSE_QVGA_SENSOR.camera
-    floor, block = box([0, 0, -5], [900, 900, 5]), box([0, 0, 25], [30, 30, 25])
-    depth = render_still([joined([floor, block])], camera, T.inverse())
-    assert depth[119, 159] == pytest.approx(550.0)
-    assert depth[10, 10] == pytest.approx(600.0)
-
-
-# training
-
-
-def test_mice_of_training_patches_wear_things_only_where_asked() -> None:
-    n = 256
-    bare, worn = (training_windows(17, n, worn_share=share) for share in (0.0, 0.6))
-    np.testing.assert_array_equal(bare.depth[:64], training_windows(17, 64).depth)
-    np.testing.assert_array_equal(bare.joints_mm, worn.joints_mm)
-    np.testing.assert_array_equal(bare.background, worn.background)
-    nearer = (bare.depth.astype(int) - worn.depth > 12) & (worn.depth > 0)
-    wears = nearer.sum(axis=(1, 2)) > 3
-    by_mouse = wears.reshape(-1, PER_SESSION).mean(axis=1)
-    assert ((by_mouse < 0.3) | (by_mouse > 0.7)).mean() > 0.9, "it is worn in all frames"
-    assert 0.4 < (by_mouse > 0.5).mean() < 0.8
 
 
 # addresses

@@ -19,13 +19,12 @@ from scipy.signal import lfilter, lfilter_zi
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body
 from liex_lab.body.surface import Surface
-from liex_lab.geometry import SE3
 from liex_lab.scene.height_maps import Patches
-from liex_lab.simulation import _render_kernels as render_kernels
-from liex_lab.simulation._sensor_kernels import ANIMAL, NORMAL, OBJECT, UNIT
-from liex_lab.simulation.scene import PART_FACES, draw_views
+from liex_lab.simulation._render_kernels import WALL_COLUMNS, part_of
+from liex_lab.simulation._sensor_kernels import ANIMAL, UNIT
+from liex_lab.simulation.scene import draw_views
 from liex_lab.simulation.species import Sensor, Species
-from liex_lab.simulation.training_patches import inverse_depth_plane, window_origin
+from liex_lab.simulation.training_patches import Views
 
 Array = NDArray[np.float64]
 
@@ -289,72 +288,48 @@ def slow_noise(rng: np.random.Generator, m: int, seconds: float, columns: int = 
 _BLOCK = 256  # frames rendered at a time
 
 
-@dataclass(frozen=True)
-class CameraPath:
-    """One fixed camera above a scene.
+def draw_camera(
+    rng: np.random.Generator,
+    species: Species,
+    sensor: Sensor,
+    fur: Array,
+    height_mm: float,
+    stride: int,
+) -> Views:
+    """Draw a camera of a make at a given height, with every `stride`-th pixel read.
 
-    Attributes:
-        intrinsics: (4,) fx, fy, cx, cy of the rendered images, px.
-        size_px: (2,) their width and height, px.
-        T_arena_camera: its pose.
-        parameters: (N_PARAMETERS,) of the unit's sensor.
-        floor_error: (3,) error of the estimated floor: slopes along x and y, rad, and mm farther
-            below the camera.
+    Its image is twice as wide and high as the sensor's, so that an animal has space for long
+    stretches of action.
+
+    Args:
+        rng: random number generator.
+        species: the species, which sets the scene's tilt and scale.
+        sensor: the camera's make.
+        fur: (1,) of the animal, from 0 to 1.
+        height_mm: of the camera above the floor, mm.
+        stride: sensor pixels per image pixel.
+
+    Returns:
+        The camera, a batch of one.
     """
-
-    intrinsics: Array
-    size_px: NDArray[np.int64]
-    T_arena_camera: SE3
-    parameters: Array
-    floor_error: Array
-
-    @staticmethod
-    def draw(
-        rng: np.random.Generator,
-        species: Species,
-        sensor: Sensor,
-        fur: Array,
-        height_mm: float,
-        stride: int,
-    ) -> CameraPath:
-        """Draw a camera of a make at a given height, with every `stride`-th pixel read.
-
-        Its image is twice as wide and high as the sensor's, so that an animal has space for long
-        stretches of action.
-
-        Args:
-            rng: random number generator.
-            species: the species, which sets the scene's tilt and scale.
-            sensor: the camera's make.
-            fur: (1,) of the animal, from 0 to 1.
-            height_mm: of the camera above the floor, mm.
-            stride: sensor pixels per image pixel.
-
-        Returns:
-            The camera.
-        """
-        camera = sensor.camera.every(stride)
-        focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
-        place = replace(
-            draw_views(rng, 1, species.setting)[0], translation=np.array([0.0, 0.0, height_mm])
-        )
-        parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))[0]
-        margin = np.array([camera.width, camera.height]) / 2.0
-        size_px = np.array([camera.width, camera.height]) + (2 * margin).astype(np.int64)
-        error = rng.standard_normal(3) * [0.002, 0.002, 0.5 * species.setting.scale]
-        return CameraPath(
-            np.array([*focal, camera.cx + margin[0], camera.cy + margin[1]]),
-            size_px,
-            place,
-            parameters,
-            error,
-        )
+    camera = sensor.camera.every(stride)
+    focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
+    place = replace(
+        draw_views(rng, 1, species.setting), translation=np.array([[0.0, 0.0, height_mm]])
+    )
+    parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))
+    size_px = np.array([[camera.width, camera.height]])
+    error = rng.standard_normal((1, 3)) * [0.002, 0.002, 0.5 * species.setting.scale]
+    middle = np.array([camera.cx, camera.cy]) + size_px[0] / 2.0
+    intrinsics = np.concatenate([focal, middle])[None]
+    whole = size_px + (2 * (size_px / 2.0)).astype(np.int64)
+    return Views(intrinsics, whole, place, parameters, np.zeros(1), error)
 
 
 def render_agent(
     rng: np.random.Generator,
     species: Species,
-    camera: CameraPath,
+    camera: Views,
     shape: Body,
     pose: Pose,
     girth: Array,
@@ -366,7 +341,7 @@ def render_agent(
     Args:
         rng: random number generator for the noise and the tail.
         species: the species.
-        camera: the camera.
+        camera: the camera, a batch of one.
         shape: its body, a batch of which the first is used.
         pose: (n) arena frame.
         girth: (n,) factor of all lengths across the body.
@@ -380,39 +355,27 @@ def render_agent(
     n = len(girth)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     bends = species.bends(rng, 1)
+    if walls is None:
+        walls = np.zeros((n, WALL_COLUMNS))
     for start in range(0, n, _BLOCK):
         part = slice(start, min(start + _BLOCK, n))
-        m = part.stop - part.start
-        lying = None if bends is None else np.repeat(bends, m, axis=0)
-        vertices = surface.vertices(pose[part], shape[0].broadcast(m), girth[part], lying)
-        T = camera.T_arena_camera[np.newaxis][np.zeros(m, np.int64)]
-        intrinsics = np.tile(camera.intrinsics, (m, 1))
-        trunk = vertices[:, : surface.n_trunk_vertices]
-        origin = window_origin(trunk, T.inverse(), intrinsics, window_px)
-        depth = np.empty((m, window_px, window_px), np.uint16)
-        background = np.empty_like(depth)
-        nothing = np.zeros((m, 3, 3))
-        render_kernels.draw_windows(
-            render_kernels.part_of(vertices, surface.faces, ANIMAL),
-            render_kernels.part_of(nothing, PART_FACES[:0], OBJECT, np.zeros(m)),
-            render_kernels.PatchCamera(intrinsics, np.tile(camera.size_px, (m, 1)), origin),
-            render_kernels.ArenaView(
-                T.rotation,
-                T.translation[:, 2].copy(),
-                np.zeros((m, render_kernels.WALL_COLUMNS)) if walls is None else walls[part],
-                np.zeros(m),
-            ),
-            render_kernels.SensorNoise(np.tile(camera.parameters, (m, 1)), seeds[part], NORMAL),
-            depth,
-            background,
+        one = np.zeros(part.stop - start, np.int64)
+        views = camera[one]
+        lying = None if bends is None else bends[one]
+        vertices = surface.vertices(pose[part], shape[one], girth[part], lying)
+        origin, depth, background = views.patches(
+            (part_of(vertices, surface.faces, ANIMAL),),
+            vertices[:, : surface.n_trunk_vertices],
+            walls[part],
+            seeds[part],
+            window_px,
         )
-        unit = np.float32(camera.parameters[UNIT])
-        floor = inverse_depth_plane(T, intrinsics, np.tile(camera.floor_error, (m, 1)))
+        unit = np.float32(camera.parameters[0, UNIT])
         yield Patches(
             depth * unit,
             background * unit,
-            intrinsics,
+            views.intrinsics,
             origin.astype(float),
-            floor,
+            views.floor,
             species.skeleton.view,
         )

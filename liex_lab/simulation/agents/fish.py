@@ -37,7 +37,6 @@ Array = NDArray[np.float64]
 ACTIONS = ("scoot", "j_turn", "c_turn", "r_turn", "surface", "dive", "zigzag", "thrash", "freeze")
 _ROLL, _FRONT, _HIND, _WAVE, _BEAT = range(3, 8)
 _CHANNELS = 8
-_BLEND_S = 0.008
 # relative frequencies in an uncut recording; other movements are unnamed
 _SHARES = {
     "scoot": 5.0,
@@ -50,9 +49,6 @@ _SHARES = {
     "thrash": 1.4,
     "freeze": 1.4,
 }
-_NEAREST_MM = 185.0  # smallest distance to the camera
-_VIEW = 0.32  # half the image's side over the distance
-_BETWEEN = 0.75  # share of actions followed by an unnamed movement
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ class FishActor:
 
     def _half(self, z: Array | float) -> Array | float:
         """Half the side of the view, mm, at a height."""
-        return _VIEW * (self.camera_mm - z) - 0.6 * self.length_mm
+        return 0.32 * (self.camera_mm - z) - 0.6 * self.length_mm
 
     def begin(self, rng: np.random.Generator, word: str = UNLABELLED) -> BehaviourSequence:
         """Begin a sequence at a random position near the centre, at a height that suits the action.
@@ -106,7 +102,7 @@ class FishActor:
         z = low + level * (high - low)
         place = [*(rng.uniform(-0.6, 0.6, 2) * self._half(z)), z]
         return BehaviourSequence(
-            np.zeros(_CHANNELS), _BLEND_S, np.array(place), rng.uniform(-np.pi, np.pi), self.fits
+            np.zeros(_CHANNELS), 0.008, np.array(place), rng.uniform(-np.pi, np.pi), self.fits
         )
 
     def cut(self, rng: np.random.Generator, word: str) -> ActedMotion:
@@ -144,7 +140,8 @@ class FishActor:
         names, share = own_shares(rng, _SHARES)
         while sequence.n_steps * STEP_S < seconds:
             word = str(rng.choice(names, p=share))
-            if sequence.play(word, partial(self.act, rng, word), 6) and rng.random() > _BETWEEN:
+            # most actions are followed by an unnamed movement
+            if sequence.play(word, partial(self.act, rng, word), 6) and rng.random() > 0.75:
                 continue
             if not sequence.play(UNLABELLED, lambda: self._between(rng, None)):
                 self._go_home(rng, sequence)
@@ -491,4 +488,4 @@ def depth_of_water(
         Lowest and highest, mm above the floor.
     """
     reach = size * (float(np.max(shape.half_height)) + 0.36 * species.skeleton.length)
-    return reach, camera_mm - _NEAREST_MM - reach
+    return reach, camera_mm - 185.0 - reach

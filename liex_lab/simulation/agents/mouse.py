@@ -56,7 +56,6 @@ _BEND = slice(7, 10)
 _STRETCH = 10
 _ROLL = 11
 _CHANNELS = 12
-_BLEND_S = 0.035
 _SHARES = {
     "walk": 5.0,
     "run": 2.5,
@@ -71,8 +70,6 @@ _SHARES = {
     "dart": 2.5,
     "stretch_attend": 1.5,
 }
-_BETWEEN = 0.3  # share of actions followed by an unnamed movement
-_STRIDE_HZ_PER_SPINE = 1.6
 _WALL_MM = 50.0  # nose-to-wall distance for a supported rear
 
 
@@ -141,7 +138,7 @@ class MouseActor:
         rest[_RISE] = self.rest
         rest[_STRETCH] = 1.0
         start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
-        sequence = BehaviourSequence(rest, _BLEND_S, start, rng.uniform(-np.pi, np.pi), self.fits)
+        sequence = BehaviourSequence(rest, 0.035, start, rng.uniform(-np.pi, np.pi), self.fits)
         names, share = own_shares(rng, _SHARES)
         while sequence.n_steps * STEP_S < seconds:
             word = str(rng.choice(names, p=share))
@@ -153,7 +150,8 @@ class MouseActor:
             if not done and word in ("walk", "run", "dart"):  # no room ahead
                 self._turn_home(rng, sequence)
                 sequence.play(word, partial(self.act, rng, word), 8)
-            elif rng.random() < _BETWEEN and not sequence.play(
+            # some actions are followed by an unnamed movement
+            elif rng.random() < 0.3 and not sequence.play(
                 UNLABELLED, lambda: self._between(rng), 4
             ):
                 self._turn_home(rng, sequence)
@@ -282,7 +280,7 @@ class MouseActor:
         c[:, TURN] = turn
         if gait:
             spines = np.abs(c[:, SPEED]) / self.spine_mm
-            strides = np.sqrt(spines) * _STRIDE_HZ_PER_SPINE * self.mouse.tempo
+            strides = np.sqrt(spines) * 1.6 * self.mouse.tempo
             sway = 0.06 * np.minimum(spines, 1.0) * np.sin(2 * np.pi * np.cumsum(strides) * STEP_S)
             c[:, _BEND] += sway[:, None] * [1.0, -0.5, -0.5]
         return c

@@ -19,7 +19,6 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.variation import N_ARM_CAPSULES, HandShape, arm_vertices, draw_hands, forearms
 from liex_lab.geometry import SE3
-from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.images.nyu import (
     LABEL_CAMERA,
     N_FIRST_PERSON,
@@ -27,33 +26,36 @@ from liex_lab.recordings.formats.images.nyu import (
     fit_hands,
 )
 from liex_lab.runtime.memory import Rows
-from liex_lab.runtime.processes import threads
+from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import sight_rotations
 from liex_lab.simulation import _render_kernels as kernels
 from liex_lab.simulation._render_kernels import PatchCamera, SensorNoise, part_of
-from liex_lab.simulation._sensor_kernels import ANIMAL, NORMAL, OBJECT, PRIMESENSE_KIND
+from liex_lab.simulation._sensor_kernels import (
+    ANIMAL,
+    N_PARAMETERS,
+    NORMAL,
+    OBJECT,
+    PRIMESENSE_KIND,
+)
 from liex_lab.simulation.hand.pose_prior import (
     DRAWN,
     FITTED,
-    Gestures,
     draw_gestures,
     draw_observed,
     draw_wide,
 )
 from liex_lab.simulation.pose_prior import SIZE_RANGE
-from liex_lab.simulation.recording import OTHER_CAMERA, TrueRecording, planned
+from liex_lab.simulation.recording import OTHER_CAMERA, TrueRecording, planned, whole_images
 from liex_lab.simulation.scene import PART_FACES, SPHERE_TUBE, rounded
 from liex_lab.simulation.species import KINECT_V2_SENSOR, Sensor, unseen
 from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, degrade
 
 Array = NDArray[np.float64]
 
-DISTANCE_MM = (400.0, 1200.0)
 ARM_FACES = joined_faces([(CAPSULE_RINGS, CAPSULE_SEGMENTS)] * N_ARM_CAPSULES)
-_N_BODY_PARTS = 3  # torso, head, and another object behind
-BODY_FACES = joined_faces([SPHERE_TUBE] * _N_BODY_PARTS)
-_EDGE_MM = 110.0  # minimum distance of the palm from the image border
+# torso, head, and another object behind
+BODY_FACES = joined_faces([SPHERE_TUBE] * 3)
 
 
 @dataclass(frozen=True)
@@ -91,15 +93,12 @@ class HandFrameContents(Rows):
     faces: NDArray[np.int32]
     object_faces: NDArray[np.int32] = field(default_factory=lambda: PART_FACES)
 
-    def images(
-        self, cameras: PatchCamera, shape: tuple[int, int], parallel: bool = True
-    ) -> NDArray[np.uint16]:
+    def images(self, cameras: PatchCamera, shape: tuple[int, int]) -> NDArray[np.uint16]:
         """Render depth images.
 
         Args:
             cameras: of the n images.
             shape: rows and columns of the rendered part.
-            parallel: render on all threads.
 
         Returns:
             (n, *shape) uint16 mm, 0 if unread.
@@ -112,17 +111,8 @@ class HandFrameContents(Rows):
         )
         noises = SensorNoise(self.parameters, self.seeds, NORMAL)
         out = np.empty((len(self.seeds), *shape), np.uint16)
-        with threads(parallel):
-            kernels.draw_hands(*parts, self.wall, cameras, noises, out)
+        in_parallel(kernels.draw_hands, len(out), parts, self.wall, cameras, noises, out)
         return out
-
-
-def whole_images(camera: Camera, n: int) -> PatchCamera:
-    """The camera of n whole images."""
-    size = np.array([camera.width, camera.height])
-    return PatchCamera(
-        np.tile(camera.intrinsics, (n, 1)), np.tile(size, (n, 1)), np.zeros((n, 2), np.int64)
-    )
 
 
 def hold_out(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pose:
@@ -160,7 +150,8 @@ def draw_places(
     """
     n = len(low)
     depth = rng.uniform(low, high)
-    margin = np.minimum(_EDGE_MM * intrinsics[:, 0] / depth, 0.45 * size_px.min(axis=1))
+    # minimum distance of the palm from the image border
+    margin = np.minimum(110.0 * intrinsics[:, 0] / depth, 0.45 * size_px.min(axis=1))
     uv = margin[:, None] + rng.random((n, 2)) * (size_px - 2.0 * margin[:, None])
     xy = (uv - intrinsics[:, 2:]) / intrinsics[:, :2] * depth[:, None]
     return np.concatenate([xy, depth[:, None]], axis=1)
@@ -316,10 +307,6 @@ _KINDS = (
     (NYU_SENSOR, 2, 400.0, 700.0, 0.20),
     (KINECT_V2_SENSOR, 1, 400.0, 1000.0, 0.25),
 )
-_OBJECT_SHARE = 0.15
-_LEAST_PX = 320  # smallest height of the images that windows are cut from
-_FLAT = np.array([0.0, 0.0, 1.0])
-_FLOOR_MM = 1300.0  # depth of the plane that replaces the arena's floor
 
 
 class HandSession(TrueRecording):
@@ -351,7 +338,7 @@ class HandSession(TrueRecording):
             times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
         """
         times = np.arange(len(contents.seeds)) * FRAME_NS if times_ns is None else times_ns
-        floor = Floor.from_plane(_FLAT, _FLOOR_MM, sensor.camera)
+        floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1300.0, sensor.camera)
         super().__init__(
             name,
             sensor.camera,
@@ -380,6 +367,10 @@ class HandSession(TrueRecording):
         cameras = whole_images(c, stop - start)
         some = self.contents[start:stop]
         return some.images(cameras, (c.height, c.width)).astype(np.float32)
+
+
+# angles, T_view_palm, places and wrist rotations of n hands, see `draw_gestures`
+_Acted = tuple[Array, Array, Array, Array | None]
 
 
 @dataclass(frozen=True)
@@ -426,83 +417,60 @@ class HandSimulator:
         )
 
     def training_blocks(
-        self, seed: int, n_blocks: int, *, first: int = 0, **settings: Any
-    ) -> Iterator[TrainingPatches]:
-        """Blocks of training patches with truth; see `training_patches.training_blocks`.
-
-        Args:
-            seed: of the whole set.
-            n_blocks: number of blocks.
-            first: number of the first block.
-            **settings: family, noise, erosion_px, degraded_share, spine_mm, window_px (320 px) and
-                parallel, as in `training_patches.training_blocks`.
-
-        Yields:
-            The images of one block.
-        """
-        for number in range(first, first + n_blocks):
-            yield self._block(np.random.default_rng([seed, number, 1]), number, **settings)
-
-    def _block(
         self,
-        rng: np.random.Generator,
-        number: int,
+        seed: int,
+        n_blocks: int,
         *,
+        first: int = 0,
         family: str = "train",
-        noise: float = 1.0,
-        erosion_px: int = 0,
         degraded_share: float = 0.0,
         spine_mm: float | None = None,
         window_px: int = 320,
-        parallel: bool = True,
-    ) -> TrainingPatches:
-        """The images of one block."""
+    ) -> Iterator[TrainingPatches]:
+        """Blocks of training patches with truth; see `training_patches.training_blocks`."""
         skeleton = self.skeleton
-        n = BLOCK
         m = BLOCK // PER_SESSION
         each = np.repeat(np.arange(m), PER_SESSION)
-        kind, intrinsics, size_px, parameters = _draw_cameras(rng, m, noise, erosion_px)
-        degrade(rng, parameters, degraded_share)
-        shape = draw_hands(rng, skeleton, family, m)[each]
         nominal = 1.0 if spine_mm is None else spine_mm / skeleton.length
-        size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
-        kind, intrinsics = kind[each], intrinsics[each]
-        size_px, parameters = size_px[each], parameters[each]
-        low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind]
-        angles, turns = draw_wide(rng, skeleton, n)
-        places = draw_places(rng, intrinsics, size_px.astype(float), low, high)
-        pose = hold_out(angles, turns, size, places)
-        contents = assemble(
-            rng, skeleton, pose, shape, size, intrinsics, parameters, _OBJECT_SHARE, PER_SESSION
-        )
-        uv = contents.hand[..., :2] / contents.hand[..., 2:] * intrinsics[:, None, :2]
-        uv = uv + intrinsics[:, None, 2:]
-        shift = rng.uniform(-0.08, 0.08, (n, 2)) * window_px
-        middle = (uv.min(axis=1) + uv.max(axis=1)) / 2.0
-        origin = np.floor(middle - window_px / 2.0 + shift).astype(np.int64)
-        # an arm leaves a window as it leaves an image
-        origin = np.clip(origin, 0, np.maximum(size_px - window_px, 0))
-        cameras = PatchCamera(intrinsics, size_px, origin)
-        depth = contents.images(cameras, (window_px, window_px), parallel)
-        flat = np.zeros((n, 3))
-        return TrainingPatches(
-            depth,
-            np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
-            origin.astype(np.int32),
-            intrinsics,
-            flat,
-            flat,
-            SE3.identity(n),
-            pose.root,
-            pose.angles,
-            pose.scale,
-            contents.joints,
-            contents.spine_mm,
-            number * m + each,
-            kind,
-            np.zeros(n, np.int64),
-            own_bones=True,
-        )
+        flat = np.zeros((BLOCK, 3))
+        for number in range(first, first + n_blocks):
+            rng = np.random.default_rng([seed, number, 1])
+            cameras = _draw_cameras(rng, m)
+            degrade(rng, cameras[-1], degraded_share)
+            shape = draw_hands(rng, skeleton, family, m)[each]
+            size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
+            kind, intrinsics, size_px, parameters = (part[each] for part in cameras)
+            low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind]
+            angles, turns = draw_wide(rng, skeleton, BLOCK)
+            places = draw_places(rng, intrinsics, size_px.astype(float), low, high)
+            pose = hold_out(angles, turns, size, places)
+            contents = assemble(
+                rng, skeleton, pose, shape, size, intrinsics, parameters, 0.15, PER_SESSION
+            )
+            uv = contents.hand[..., :2] / contents.hand[..., 2:] * intrinsics[:, None, :2]
+            uv = uv + intrinsics[:, None, 2:]
+            shift = rng.uniform(-0.08, 0.08, (BLOCK, 2)) * window_px
+            middle = (uv.min(axis=1) + uv.max(axis=1)) / 2.0
+            origin = np.floor(middle - window_px / 2.0 + shift).astype(np.int64)
+            # an arm leaves a window as it leaves an image
+            origin = np.clip(origin, 0, np.maximum(size_px - window_px, 0))
+            depth = contents.images(
+                PatchCamera(intrinsics, size_px, origin), (window_px, window_px)
+            )
+            yield TrainingPatches(
+                depth,
+                np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
+                origin.astype(np.int32),
+                intrinsics,
+                flat,
+                pose.root,
+                pose.angles,
+                pose.scale,
+                contents.joints,
+                contents.spine_mm,
+                shape,
+                own_bones=True,
+            )
 
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS
@@ -532,7 +500,7 @@ class HandSimulator:
     def _film(
         self,
         n_frames: int,
-        act: Callable[[np.random.Generator, PatchCamera], tuple[Array, Array, Array, Array | None]],
+        act: Callable[[np.random.Generator, PatchCamera], _Acted],
         *,
         seed: int | list[int],
         sensor: Sensor = NYU_SENSOR,
@@ -568,9 +536,7 @@ class HandSimulator:
         )
         return HandSession(name, skeleton, sensor, contents)
 
-    def _test_hands(
-        self, rng: np.random.Generator, cameras: PatchCamera
-    ) -> tuple[Array, Array, Array, None]:
+    def _test_hands(self, rng: np.random.Generator, cameras: PatchCamera) -> _Acted:
         """Independent hands, with postures from the reference (not used in training)."""
         n = len(cameras.size)
         if self.reference is None:
@@ -583,7 +549,7 @@ class HandSimulator:
                 pose.angles,
                 sight_rotations(pose.root.translation) @ pose.root.rotation,
             )
-        low, high = np.full((2, n), np.array(DISTANCE_MM)[:, None])
+        low, high = np.full((2, n), np.array((400.0, 1200.0))[:, None])
         places = draw_places(rng, cameras.intrinsics, cameras.size.astype(float), low, high)
         return angles, turns, places, None
 
@@ -600,7 +566,7 @@ class HandSimulator:
             The recording with its truth.
         """
 
-        def act(rng: np.random.Generator, cameras: PatchCamera) -> Gestures:
+        def act(rng: np.random.Generator, cameras: PatchCamera) -> _Acted:
             near, far = np.array([[550.0], [850.0]])
             size = cameras.size[:1].astype(float)
             (middle,) = draw_places(rng, cameras.intrinsics[:1], size, near, far)
@@ -610,7 +576,7 @@ class HandSimulator:
 
 
 def _draw_cameras(
-    rng: np.random.Generator, m: int, noise: float, erosion_px: int
+    rng: np.random.Generator, m: int
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
     """Kind (m,), intrinsics (m, 4), image size (m, 2) and sensor parameters of m cameras."""
     kind = rng.choice(len(_KINDS), m, p=[k[4] for k in _KINDS])
@@ -618,15 +584,13 @@ def _draw_cameras(
     axis = rng.normal(0.0, 4.0, (m, 2))
     intrinsics = np.empty((m, 4))
     size_px = np.empty((m, 2), np.int64)
-    parameters = np.empty((m, 0))
+    parameters = np.empty((m, N_PARAMETERS))
     for k, (sensor, coarse, *_) in enumerate(_KINDS):
         rows = kind == k
         c = sensor.camera
-        drawn = sensor.draw(rng, m, np.zeros(m), noise, erosion_px)
-        parameters = np.where(rows[:, None], drawn, parameters) if parameters.size else drawn
-        whole = (
-            np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1) / coarse
-        )
-        intrinsics[rows] = whole[rows]
-        size_px[rows] = (c.width // coarse, max(c.height // coarse, _LEAST_PX))
+        parameters[rows] = sensor.draw(rng, m, np.zeros(m))[rows]
+        whole = np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1)
+        intrinsics[rows] = whole[rows] / coarse
+        # windows are cut from at least 320 rows
+        size_px[rows] = (c.width // coarse, max(c.height // coarse, 320))
     return kind, intrinsics, size_px, parameters

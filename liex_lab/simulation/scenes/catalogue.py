@@ -173,12 +173,8 @@ RECIPES: Final[Mapping[str, SceneRecipe]] = MappingProxyType(
 
 Array = NDArray[np.float64]
 
-_EPOCHS = 64  # maximum number of still depth images per recording
-_EPOCH_FRAMES = 12
 _COMMUTATOR_MM = np.array([80.0, 110.0, 300.0])  # from the centre of the arena
-_HAND_FRAMES = 16  # duration of a hand's visit
 _OBJECTS = {"object": 0.4, "object out": 0.6}  # time of the change, share of the recording
-_WARM_UP = 0.35  # time constant of a sensor's drift, share of the recording
 
 
 @dataclass(frozen=True)
@@ -236,13 +232,14 @@ class Making:
             self.sensor.draw(self._rng("sensor"), 1, fur)[0],
             noise.integers(1, 2**63, self.n_frames).astype(np.uint64),
             recipe.drift_mm
-            * (1.0 - np.exp(-np.arange(self.n_frames) / max(1.0, _WARM_UP * self.n_frames))),
+            * (1.0 - np.exp(-np.arange(self.n_frames) / max(1.0, 0.35 * self.n_frames))),
         )
         return SceneRecording(f"scene-{self.name}-{self.seed}", self.name, stage)
 
     @property
     def _epoch_frames(self) -> int:
-        return max(_EPOCH_FRAMES, -(-self.n_frames // _EPOCHS))
+        # at most 64 still depth images
+        return max(12, -(-self.n_frames // 64))
 
     def _arenas(self) -> list[SimulatedScene]:
         """The arenas in the image, around the point where the camera's axis meets the floor,
@@ -332,7 +329,8 @@ class Making:
         """A hand that moves down to a position, releases or takes something, and leaves."""
         mesh = draw_object(self._rng("object"), "hand", 65.0)
         mesh[:, 2] -= mesh[:, 2].min()
-        reach = _HAND_FRAMES // 2
+        # frames before and after the moment
+        reach = 8
         height = 45.0 + 22.0 * np.abs(np.arange(-reach, reach + 1))
         vertices = mesh + np.column_stack([np.tile(spot, (len(height), 1)), height])[:, None]
         moment = np.arange(self.n_frames) - change + reach

@@ -248,56 +248,6 @@ def _hanging(mount: SE3, commutator: Array, length: Array, way: Array) -> Array:
     return np.asarray(straight + swing + stiff)
 
 
-def draw_worn(
-    rng: np.random.Generator,
-    skeleton: Skeleton,
-    pose: Pose,
-    shape: BodyShape,
-    girth: Array,
-    share: float,
-    per_session: int,
-) -> tuple[Mesh, NDArray[np.bool_]]:
-    """Head stages and cables of animals in independent postures, for training images.
-
-    Half of the animals with equipment have a head stage of 6 to 14 mm a side, the others a plug and
-    a cable of 2 to 5 mm to their own commutator.
-
-    Args:
-        rng: random number generator.
-        skeleton: of the animals, a chain.
-        pose: (n) arena frame.
-        shape: (n) their bodies.
-        girth: (n,) factors of all lengths across the bodies.
-        share: share of animals with equipment.
-        per_session: consecutive postures of one animal.
-
-    Returns:
-        Their meshes (n, V, 3) mm, arena frame, and whether each posture has them (n,).
-    """
-    n = len(girth)
-    each = np.arange(n) // per_session
-    m = int(each[-1]) + 1
-    wears = rng.random(m) < share
-    tethered = rng.random(m) < 0.5
-    blocks = rng.uniform([7.0, 6.0, 7.0], [14.0, 10.0, 14.0], (m, 3))
-    sides = np.where(tethered[:, None], np.array(PLUG_MM), blocks)[each]
-    mount = on_head(skeleton, pose, shape, girth)
-    block = box([0.0, 0.0, 0.0], [0.5, 0.5, 0.5])
-    local = block.vertices * sides[:, None]
-    local[..., 2] += 0.5 * sides[:, None, 2] - 1.0
-    stage = np.einsum("nij,nvj->nvi", mount.rotation, local) + mount.translation[:, None]
-    away = rng.uniform(0.0, 160.0, m)[each]
-    towards = rng.uniform(-np.pi, np.pi, n)
-    high = rng.uniform(180.0, 320.0, m)[each]
-    above = np.stack([away * np.cos(towards), away * np.sin(towards), high], axis=-1)
-    commutator = mount.translation + above
-    length = np.linalg.norm(above, axis=-1) * rng.uniform(1.0, 1.15, n)
-    curves = _hanging(mount, commutator, length, rng.uniform(-np.pi, np.pi, n))
-    cable, faces = cables(curves, 0.5 * rng.uniform(2.0, 5.0, m)[each])
-    cable = np.where(tethered[each][:, None, None], cable, stage[:, :1])  # one point draws nothing
-    return joined([Mesh(stage, block.faces), Mesh(cable, faces)]), wears[each]
-
-
 def holder(commutator: Array) -> list[Mesh]:
     """The commutator and the arm that supports it above the arena.
 
@@ -314,12 +264,8 @@ def holder(commutator: Array) -> list[Mesh]:
 _GRID_MM = 5.0
 _RIM_MM = 5.0
 _BASE_MM = 6.0  # between an arena's floor and the surface below
-_FAR_MM = 2600.0  # half the side of a room's floor
-_CELL_MM = 100.0
 _OUTLINE = 48  # corners of a round wall
 _LUMP_MM = 18.0
-_LUMP_SPACING_MM = 26.0
-_PRESSED = 0.55  # share of the bedding's height that an animal compresses in an epoch
 
 
 def look_down(camera_mm: float, tilt_rad: float, toward_rad: float) -> SE3:
@@ -442,7 +388,8 @@ class Bedding:
         """
         grid = np.stack(np.meshgrid(ground.x, ground.y), axis=-1)
         area = float(np.prod(2.0 * ground.arena.half))
-        n_lumps = int(area / _LUMP_SPACING_MM**2)
+        # one lump per square of 26 mm
+        n_lumps = int(area / 26.0**2)
         places = rng.uniform(-1.0, 1.0, (n_lumps, 2)) * ground.arena.half
         tall = _LUMP_MM * rng.uniform(0.35, 1.0, n_lumps)
         wide = rng.uniform(8.0, 18.0, n_lumps)
@@ -460,7 +407,8 @@ class Bedding:
                     gap = np.linalg.norm(grid - spot, axis=-1)
                     trodden = np.maximum(trodden, np.exp(-0.5 * (gap / 16.0) ** 2))
             aside = np.clip(np.abs(np.gradient(trodden)[0]) + np.abs(np.gradient(trodden)[1]), 0, 1)
-            here = here * (1.0 - _PRESSED * trodden) + 4.0 * aside * rng.random(here.shape)
+            # share of the height that an animal compresses in an epoch
+            here = here * (1.0 - 0.55 * trodden) + 4.0 * aside * rng.random(here.shape)
             epochs.append(np.minimum(here, 1.4 * _LUMP_MM).astype(np.float32))
         return Bedding(ground, np.stack(epochs), frames)
 
@@ -516,7 +464,7 @@ def level(middle: Array, z: float = -_BASE_MM) -> Mesh:
         middle: (2,) below the camera's axis, mm.
         z: its height, mm; by default that of a bench or floor below the arenas.
     """
-    reach = np.arange(-_FAR_MM, _FAR_MM + 1.0, _CELL_MM)
+    reach = np.arange(-2600.0, 2601.0, 100.0)
     return field(middle[0] + reach, middle[1] + reach, np.full((len(reach), len(reach)), z))
 
 

@@ -31,19 +31,7 @@ Array = NDArray[np.float64]
 PRESENCES = ("always", "asleep", "still", "late", "leaves", "never")
 AWAY = np.array([0.0, 0.0, 1e7])  # mm: behind any downward-facing camera
 _RATE_HZ = 30.0
-_ADULTS_MM = (55.0, 75.0)
-_BREATHS_HZ = 2.5
-_BREATH = 0.012  # of the girth
-_SLEEP = (0.12, 0.90)  # of the recording, at most
-_COMES = 2.0 / 3.0
-_GOES = 0.45
-_APART = 0.95  # of a spine, between the centres of two animals
 _TRIES = 60
-_TURN_RAD_S = 5.0
-_PAUSE_S = 0.8
-_DOOR_MM = 25.0
-_ARRIVED_MM = 6.0
-_ERRAND = 1.8  # spines per second on the way to a door
 
 
 @dataclass(frozen=True)
@@ -96,7 +84,7 @@ class SceneAnimal:
         """
         moments, present = timing
         body = np.random.default_rng([seed, which, 1])
-        drawn = float(body.uniform(*_ADULTS_MM))
+        drawn = float(body.uniform(55.0, 75.0))
         spine = drawn if spine_mm is None else float(spine_mm)
         shape = species.shapes(body, family, 1)
         n_moments = int(moments.max()) + 1
@@ -107,9 +95,8 @@ class SceneAnimal:
         assert first is not None  # mice have tails
         bends = first + 4.0 * smoothed(tail.normal(0.0, 0.05, (n_moments, first.shape[1])), 3.6)
         asleep = np.diff(moments, prepend=moments[0] - 1) == 0
-        breath = 1.0 + _BREATH * np.sin(
-            2 * np.pi * _BREATHS_HZ * np.arange(len(moments)) / _RATE_HZ
-        )
+        # share of the girth; breaths per frame
+        breath = 1.0 + 0.012 * np.sin(2 * np.pi * 2.5 * np.arange(len(moments)) / _RATE_HZ)
         return SceneAnimal(
             spine,
             shape,
@@ -159,15 +146,15 @@ def timing_of(presence: str, n_frames: int) -> tuple[NDArray[np.int64], NDArray[
     frame = np.arange(n_frames)
     there = np.ones(n_frames, np.bool_)
     if presence == "asleep":
-        falls, wakes = (int(share * n_frames) for share in _SLEEP)
+        falls, wakes = (int(share * n_frames) for share in (0.12, 0.90))
         return np.where(frame < falls, frame, np.maximum(falls, frame - (wakes - falls))), there
     if presence == "still":
         return np.zeros(n_frames, np.int64), there
     if presence == "late":
-        comes = int(_COMES * n_frames)
+        comes = int(2.0 / 3.0 * n_frames)
         return np.maximum(frame - comes, 0), frame >= comes
     if presence == "leaves":
-        return frame, frame < max(1, int(_GOES * n_frames))
+        return frame, frame < max(1, int(0.45 * n_frames))
     return frame, there & (presence != "never")
 
 
@@ -182,7 +169,7 @@ def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
     while at < n:
         stop = at + int(_RATE_HZ * rng.uniform(0.8, 2.5))
         speed[at:stop] = rng.uniform(1.0, 2.4)
-        pause = stop + int(_RATE_HZ * rng.uniform(0.1, _PAUSE_S))
+        pause = stop + int(_RATE_HZ * rng.uniform(0.1, 0.8))
         speed[stop:pause] = 0.0
         at = pause
     return np.zeros(n, np.int64), np.maximum(smoothed(speed[:, None], 3.6)[:, 0], 0.0)
@@ -212,18 +199,21 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
         passing = False  # inside, or on the way through the door
         for i in range(n):
             invited = any(low <= i / n < high for low, high in spans)
-            at_door = bool(np.linalg.norm(at - door) < _DOOR_MM)
+            at_door = bool(np.linalg.norm(at - door) < 25.0)
             passing = passing or at_door if invited else passing and not at_door
             goal = inside if invited and passing else goals[(i // 45) % len(goals)]
             if invited != passing:
                 goal = door
             gap = goal - at
-            if np.linalg.norm(gap) > _ARRIVED_MM:
+            # not there yet
+            if np.linalg.norm(gap) > 6.0:
                 errand = invited or passing
                 ahead = np.arctan2(gap[1], gap[0])
-                most = (2.0 if errand else 1.0) * _TURN_RAD_S / _RATE_HZ
+                # up to 5 rad/s, twice as fast on an errand
+                most = (2.0 if errand else 1.0) * 5.0 / _RATE_HZ
                 way += np.clip((ahead - way + np.pi) % (2 * np.pi) - np.pi, -most, most)
-                run = max(speed[i], _ERRAND * spine_mm * errand) / _RATE_HZ
+                # at least 1.8 spines per second on an errand
+                run = max(speed[i], 1.8 * spine_mm * errand) / _RATE_HZ
                 facing = max(float(np.cos(ahead - way)), 0.1)
                 step = run * facing * np.array([np.cos(way), np.sin(way)])
                 if errand or scene.freedom(at + step) > 0.4 * spine_mm:
@@ -274,7 +264,7 @@ def keeping_apart(other: Array, spine_mm: float) -> Path:
             if gap > best_gap:
                 best = (position, heading)
                 best_gap = gap
-            if gap > _APART * 0.5 * (spine_mm + own_mm):
+            if gap > 0.95 * 0.5 * (spine_mm + own_mm):
                 break
         assert best is not None
         return best
@@ -516,8 +506,7 @@ class SceneRecording(TrueScene):
         objects = _together(n, [one.placed(part) for one in stage.moving])
         depth = render_frames(
             stage.stills[epoch],
-            part_of(*animals, ANIMAL),
-            part_of(*objects, OBJECT),
+            (part_of(*animals, ANIMAL), part_of(*objects, OBJECT)),
             stage.camera,
             stage.T_arena_camera,
             np.tile(stage.parameters, (n, 1)),

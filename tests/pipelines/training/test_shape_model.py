@@ -14,7 +14,7 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior
 from liex_lab.simulation import training_patches
 from liex_lab.simulation.species import FishSpecies
-from liex_lab.simulation.training_patches import BLOCK, drawn_bodies, training_blocks
+from liex_lab.simulation.training_patches import BLOCK, training_blocks
 
 N = BLOCK // PER_SESSION
 
@@ -58,14 +58,13 @@ def test_a_mini_session_tells_the_build_of_the_animal_that_was_rendered(others):
 
 
 @pytest.mark.nightly
-def test_bodies_are_drawn_again_as_the_block_shows_them():
+def test_bodies_of_a_block_are_those_that_it_shows():
     drawn = {"family": "wide", "per_session": PER_SESSION, "degraded_share": 0.5}
     species = FishSpecies()
-    bodies = drawn_bodies(5, 0, species, **drawn)
     (block,) = training_blocks(5, 1, species, window_px=272, **drawn)
+    bodies = block.body[::PER_SESSION]
     assert isinstance(bodies, BodyShape)
     assert len(bodies) == N
-    assert np.bincount(block.session).tolist() == [PER_SESSION] * N
     # what is read over a joint of the trunk is the skin of these very bodies, in the median
     j, skeleton = 6, species.skeleton
     joint = block.joints_mm[:, j]
