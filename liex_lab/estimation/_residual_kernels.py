@@ -17,14 +17,7 @@ from liex_lab.scene._height_map_kernels import crop_camera, to_pixel, to_point
 
 N_FIT = 8
 # columns of the fit, see `explain`
-BESIDE = 0
-OFF = 1
-OUT_OF = 2
-HIDDEN = 3
-APART = 4
-FAR = 5
-WITHIN = 6
-ALONG = 7
+BESIDE, OFF, OUT_OF, HIDDEN, APART, FAR, WITHIN, ALONG = range(N_FIT)
 # thresholds are integers
 SHARE_UNIT = 1000.0
 MM_UNIT = 50.0

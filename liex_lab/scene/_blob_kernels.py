@@ -78,15 +78,7 @@ class BlobMoments(NamedTuple):
 
 
 N_MOMENTS = len(BlobMoments._fields)
-N_PX = BlobMoments._fields.index("n_px")
-AREA = BlobMoments._fields.index("area_mm2")
-VOLUME = BlobMoments._fields.index("volume_mm3")
-X = BlobMoments._fields.index("x")
-Y = BlobMoments._fields.index("y")
-ANGLE = BlobMoments._fields.index("angle")
-SD_ALONG = BlobMoments._fields.index("sd_along")
-SD_ACROSS = BlobMoments._fields.index("sd_across")
-SLOPE = BlobMoments._fields.index("slope")
+N_PX, AREA, VOLUME, X, Y, ANGLE, SD_ALONG, SD_ACROSS, SLOPE = range(N_MOMENTS)
 
 
 @inner_kernel()

@@ -38,10 +38,7 @@ _MARGIN = 2  # blocks: many cameras have no readings along the image border
 # columns of a geodesic extremum: rank (depth mm, reduced for large persistence); block row; block
 # column; depth mm
 N_END = 4
-END_RANK = 0
-END_ROW = 1
-END_COLUMN = 2
-END_DEPTH = 3
+END_RANK, END_ROW, END_COLUMN, END_DEPTH = range(N_END)
 
 
 class SurfaceBlocks(NamedTuple):

@@ -147,13 +147,8 @@ _RIM_MM = 45.0  # pixels next to a block of the hand belong to it within this de
 
 
 # columns of a point of a surface: x, y, z mm, distance from the middle mm, block row, block column
-_POINT_X = 0
-_POINT_Y = 1
-_POINT_Z = 2
-_POINT_DISTANCE = 3
-_POINT_ROW = 4
-_POINT_COLUMN = 5
 _N_POINT = 6
+_POINT_X, _POINT_Y, _POINT_Z, _POINT_DISTANCE, _POINT_ROW, _POINT_COLUMN = range(_N_POINT)
 
 
 class HandSight(NamedTuple):

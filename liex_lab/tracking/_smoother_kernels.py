@@ -22,32 +22,6 @@ from liex_lab.geometry._kernels import cholesky, exp_so3, log_so3, substitute
 from liex_lab.runtime.kernels import inner_kernel, kernel
 
 
-class Moves(NamedTuple):
-    """A `Motion` for the kernels; rows are (error, process variance, decay time).
-
-    Attributes:
-        position_error: (3,) along the animal, sideways, up; over the predicted mean joint error.
-        position_variance: (3,) process variance along the arena's axes, lengths^2/s^3.
-        position_decay_s: decay time of the velocity of the joints' mean, s.
-        turn: (3, 3) a row for each axis of the base's rotation.
-        bend: (3, 3) a row for each axis of the joint angles.
-        size: (3,) of the log scale.
-        degrees_of_freedom: degrees of freedom ν of the errors' t distribution.
-        gate: gate, predicted errors.
-        correlated_share: correlated share of an error.
-    """
-
-    position_error: NDArray[np.float64]
-    position_variance: NDArray[np.float64]
-    position_decay_s: float
-    turn: NDArray[np.float64]
-    bend: NDArray[np.float64]
-    size: NDArray[np.float64]
-    degrees_of_freedom: float
-    gate: float
-    correlated_share: float
-
-
 class TrackPoses(NamedTuple):
     """Poses of n frames as arrays.
 
@@ -307,13 +281,8 @@ def gains(times, r, q, tau, start, gain, covariances):
         covariances: `Covariances`, output.
     """
     n = times.size
-    decay = gain.decay
-    gain_dt = gain.gain_dt
-    kalman_gain = gain.kalman_gain
-    rts_gain = gain.rts_gain
-    filtered = covariances.filtered
-    predicted = covariances.predicted
-    smoothed = covariances.smoothed
+    decay, gain_dt, kalman_gain, rts_gain = gain
+    filtered, predicted, smoothed = covariances
     p = np.empty((2, 2))
     steps(times, tau, decay, gain_dt)
     for t in range(start, n):
@@ -394,10 +363,7 @@ def smooth_values(y, known, start, gain, out, rate):
         out: (n,) output, smoothed values.
         rate: (n,) output, smoothed velocities per second, from `start` on.
     """
-    decay = gain.decay
-    gain_dt = gain.gain_dt
-    kalman_gain = gain.kalman_gain
-    rts_gain = gain.rts_gain
+    decay, gain_dt, kalman_gain, rts_gain = gain
     n = y.size
     out[start] = y[start]
     rate[start] = 0.0
@@ -602,10 +568,7 @@ def smooth_rotations(y, known, start, gain, out, rate):
         out: (n, 3, 3) output, smoothed rotations.
         rate: (n, 3) output, smoothed angular velocities, rad/s.
     """
-    decay = gain.decay
-    gain_dt = gain.gain_dt
-    kalman_gain = gain.kalman_gain
-    rts_gain = gain.rts_gain
+    decay, gain_dt, kalman_gain, rts_gain = gain
     n = known.size
     w = np.empty(3)
     off = np.empty(3)

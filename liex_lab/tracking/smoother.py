@@ -167,25 +167,17 @@ class MotionParameters:
         per_blur, per_spread = self.stretch
         return float(np.hypot(per_blur * blur, per_spread * size_spread))
 
-    @property
-    def packed(self) -> kernels.Moves:
-        """The parameters as arrays for the numba kernels; position variance as (3,) x, y, z."""
-        turn, bend, size = (
-            np.array([[m.error, m.process_variance, m.decay_s] for m in moves])
-            for moves in (self.turn, self.bend, (self.size,))
-        )
-        level, up = self.position_variance
-        return kernels.Moves(
-            np.array(self.position_error),
-            np.array([level, level, up]),
-            self.position_decay_s,
-            turn,
-            bend,
-            size[0],
-            self.degrees_of_freedom,
-            self.gate,
-            self.correlated_share,
-        )
+    def angle_sd(self, error_mm: Array, length_mm: float) -> list[Array]:
+        """Standard deviations (n, 3) of the base's rotation and of the other joints' angles, rad.
+
+        Args:
+            error_mm: (n,) predicted mean joint errors, mm.
+            length_mm: spine length of the animal, mm.
+        """
+        return [
+            np.array([move.error for move in moves]) * error_mm[:, None] / length_mm
+            for moves in (self.turn, self.bend)
+        ]
 
 
 @dataclass(frozen=True)
@@ -227,20 +219,10 @@ class TrackingParameters:
                 coordinate are error, drive (process variance) and fade (decay time).
         """
         field_of = {stored: name for name, stored in _STORED_AS.items()}
-        motion = {field_of.get(key, key): value for key, value in table["motion"].items()}
+        motion = {field_of.get(key, key): _frozen(value) for key, value in table["motion"].items()}
         for group in ("turn", "bend"):
             motion[group] = tuple(OrnsteinUhlenbeck(*row) for row in motion[group])
         motion["size"] = OrnsteinUhlenbeck(*motion["size"])
-        for name in (
-            "position_error",
-            "position_variance",
-            "stretch",
-            "root_calibration",
-            "bend_calibration",
-        ):
-            motion[name] = tuple(motion[name])
-        motion["joint_calibration"] = tuple(motion.get("joint_calibration", ()))
-        motion["calibration"] = tuple((stated, factor) for stated, factor in motion["calibration"])
         return TrackingParameters(AssociationCosts(**table["chain"]), MotionParameters(**motion))
 
     def to_toml(self, name: str) -> str:
@@ -283,6 +265,11 @@ def tunings_with(name: str, tuning: TrackingParameters) -> str:
     return "\n".join(
         [head.rstrip("\n") + "\n", *(each.to_toml(animal) for animal, each in known.items())]
     )
+
+
+def _frozen(value: Any) -> Any:
+    """A value of a TOML table with tuples in place of lists."""
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
 def _text(value: Any) -> str:
@@ -376,7 +363,7 @@ def smooth(
     )
     made = kernels.TrackPoses(*(np.zeros(values.shape) for values in measured))
     spread = kernels.Spread(np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3)))
-    body, moves = KinematicTree.of(skeleton), motion.packed
+    body = KinematicTree.of(skeleton)
     middle, frame, weight = np.empty((n, 3)), np.empty((n, 3, 3)), np.ones(n)
     used = known.copy()
     kernels.middles(measured.joints, known, body.tip, middle, frame)
@@ -386,8 +373,8 @@ def smooth(
             made.joints,
             error_mm,
             known,
-            moves.degrees_of_freedom,
-            moves.gate,
+            motion.degrees_of_freedom,
+            motion.gate,
             weight,
             used,
         ):
@@ -398,8 +385,8 @@ def smooth(
             error_mm,
             weight,
             used,
-            moves.position_error,
-            moves.correlated_share,
+            np.array(motion.position_error),
+            motion.correlated_share,
             variance,
             r,
         )
@@ -412,7 +399,7 @@ def smooth(
             variance,
             float(length_mm),
             body,
-            moves,
+            motion,
             made,
             spread,
         )
@@ -428,7 +415,7 @@ def _smooth_once(
     variance: Array,
     length: float,
     body: KinematicTree,
-    moves: kernels.Moves,
+    motion: MotionParameters,
     made: kernels.TrackPoses,
     spread: kernels.Spread,
 ) -> None:
@@ -440,38 +427,39 @@ def _smooth_once(
     n = len(used)
     start = int(used.argmax())
     out = np.empty((n, 3))
+    level, up = motion.position_variance
     kernels.smooth_positions(
         seconds,
         middle,
         r,
         used,
         start,
-        moves.position_variance * (length * length),
-        moves.position_decay_s,
+        np.array([level, level, up]) * (length * length),
+        motion.position_decay_s,
         out,
         spread.middle,
     )
     gain, covariances = kernels.Gains.blank(n), kernels.Covariances.blank(n)
     later = np.maximum(np.arange(n), start)
 
-    def fill(a: int, group: Array, left: Array | None = None) -> kernels.Gains:
+    def fill(a: int, group: OrnsteinUhlenbeck, left: Array | None = None) -> kernels.Gains:
         """The gains of an axis with these parameters; its posterior variance goes to `left`."""
-        relative, axis = group[0] / length, gain.axis(a)
-        measured_variance = relative * relative * variance
-        kernels.gains(seconds, measured_variance, group[1], group[2], start, axis, covariances)
+        relative, axis = group.error / length, gain.axis(a)
+        r = relative * relative * variance
+        kernels.gains(seconds, r, group.process_variance, group.decay_s, start, axis, covariances)
         if left is not None:
             left[:] = covariances.smoothed[later, 0, 0]
         return axis
 
     for a in range(3):
-        fill(a, moves.turn[a], spread.turn[:, a])
+        fill(a, motion.turn[a], spread.turn[:, a])
     kernels.smooth_rotations(measured.rotation, used, start, gain, made.rotation, np.zeros((n, 3)))
-    bend = [fill(a, moves.bend[a], spread.bend[:, a]) for a in range(3)]
+    bend = [fill(a, motion.bend[a], spread.bend[:, a]) for a in range(3)]
     value, rate = np.zeros(n), np.zeros(n)
     for j, a in body.free:
         kernels.smooth_values(measured.angles[:, j, a].copy(), used, start, bend[a], value, rate)
         made.angles[:, j, a] = value
-    size = fill(0, moves.size)
+    size = fill(0, motion.size)
     kernels.smooth_values(measured.log_scale, used, start, size, made.log_scale, rate)
     kernels.place_middles(body, out, made)
 
@@ -489,14 +477,16 @@ def _curve(
     correlated_mm = motion.correlated_share * np.interp(seconds, seconds[used], error_mm[used])
     middle = np.trace(spread.middle, axis1=1, axis2=2)
     place = np.array(motion.position_error)
-    moves = motion.packed
     # parts of the predicted error due to the joints' mean and to the bends
     relative = 0.5 * middle / (place**2).sum()
-    relative += 0.5 * (spread.bend / moves.bend[:, 0] ** 2).mean(axis=1) * length_mm**2
+    bends = spread.bend / np.array([move.error for move in motion.bend]) ** 2
+    relative += 0.5 * bends.mean(axis=1) * length_mm**2
     cov_middle = spread.middle + (place**2).mean() * np.eye(3) * correlated_mm[:, None, None] ** 2
     turn, bend = (
-        np.sqrt(left + (group[:, 0] * correlated_mm[:, None] / length_mm) ** 2)
-        for left, group in ((spread.turn, moves.turn), (spread.bend, moves.bend))
+        np.sqrt(left + sd**2)
+        for left, sd in zip(
+            (spread.turn, spread.bend), motion.angle_sd(correlated_mm, length_mm), strict=True
+        )
     )
     pose = Pose(SE3(made.rotation, made.place), made.angles, np.exp(made.log_scale))
     error = np.sqrt(correlated_mm**2 + relative)

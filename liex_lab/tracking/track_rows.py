@@ -254,11 +254,9 @@ def single_frames(subject: Subject, observed: Observations) -> Track:
     path = np.where(observed.known[:, 0], 0, NONE)
     pose = observed.pose(path)
     error = observed.along(observed.error_mm, path)
-    moves = TrackingParameters.of(subject.skeleton.name).motion.packed
-    turn, bend = (
-        group[:, 0] * error[:, None] / subject.length_mm for group in (moves.turn, moves.bend)
-    )
-    middle = (moves.position_error * error[:, None])[:, :, None] ** 2 * np.eye(3)
+    motion = TrackingParameters.of(subject.skeleton.name).motion
+    turn, bend = motion.angle_sd(error, subject.length_mm)
+    middle = (np.array(motion.position_error) * error[:, None])[:, :, None] ** 2 * np.eye(3)
     curve = SmoothedCurve(
         pose, joints_of(subject.skeleton, pose), error, middle, turn, bend, path >= 0
     )

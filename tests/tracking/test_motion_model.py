@@ -3,7 +3,6 @@
 import tomllib
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from liex_lab.tracking.smoother import TrackingParameters
@@ -21,15 +20,3 @@ def test_an_animal_without_its_own_is_taken_for_a_mouse_and_a_fish_is_none():
     # but for what is of the mouse's own joints
     assert mouse.motion.joint_calibration
     assert snake == replace(mouse, motion=replace(mouse.motion, joint_calibration=()))
-
-
-def test_the_kernels_get_every_number_of_it():
-    motion = TrackingParameters.of("fish").motion
-    packed = motion.packed
-    np.testing.assert_allclose(
-        packed.turn[2],
-        [motion.turn[2].error, motion.turn[2].process_variance, motion.turn[2].decay_s],
-    )
-    np.testing.assert_allclose(
-        packed.position_variance, [motion.position_variance[0]] * 2 + [motion.position_variance[1]]
-    )
