@@ -23,8 +23,6 @@ SHARE_UNIT = 1000.0
 MM_UNIT = 50.0
 # in tenths of the balls' usual radius, as the next two: caps larger distances
 _MOST_MM = 30.0
-_HIDDEN_MM = 12.0
-_APART_MM = 8.0
 _STRIDE = 6  # step between inspected crop pixels
 
 
@@ -142,7 +140,7 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
         above = (here / 16.0 - balls[b, 2] - radius[b]) * per_mm
         off += min(abs(above), _MOST_MM)
         out_of += min(max(-above, 0.0), _MOST_MM)
-        hidden += above > _HIDDEN_MM
+        hidden += above > 12.0
     covered = max(n - beside, 1.0)
     out[BESIDE] = SHARE_UNIT * beside / n
     out[OFF] = MM_UNIT * off / covered
@@ -165,7 +163,7 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
                 continue
             nearest *= per_mm
             n_read += 1
-            far += nearest > _APART_MM
+            far += nearest > 8.0
             apart += min(max(nearest, 0.0), _MOST_MM)
             within += min(max(-nearest, 0.0), _MOST_MM)
     many = max(n_read, 1)

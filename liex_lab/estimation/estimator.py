@@ -45,13 +45,6 @@ from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
 
 Array = NDArray[np.float64]
 
-_START_SEED = 20170125
-# passes of size estimation; each corrects about a third of the error
-_SIZE_PASSES = 8
-# weight of a squared standard deviation of area or volume relative to the predicted error, at the
-# reference length
-_MM_PER_MISFIT = 0.5
-
 
 @dataclass(frozen=True)
 class Estimates:
@@ -161,7 +154,7 @@ class PoseEstimator:
     n_candidates: int = 0
     unpruned: bool = False  # all candidates run the whole chain
     n_joints: int = 0
-    start_seed: int = _START_SEED
+    start_seed: int = 20170125
 
     @staticmethod
     def load(name: str | Path = "mouse") -> PoseEstimator:
@@ -393,7 +386,8 @@ class PoseEstimator:
             pair = both.crops[unsure], both.crops[n:]
             if method.camera_view:  # similarity is measured in the scene's own view
                 pair = scene.extract_both(depths[unsure], size)
-            weight = _MM_PER_MISFIT * self.skeleton.relative_size
+            # of a squared standard deviation relative to the predicted error
+            weight = 0.5 * self.skeleton.relative_size
             misfit, other_misfit = (weight * scene.misfit(crop) for crop in pair)
             if method.metric_on_own:
                 misfit = both.scores[unsure].min(axis=1) + misfit
@@ -475,7 +469,7 @@ class PoseEstimator:
         guess = float(np.sqrt(scene.area_mm2 / self.model.calibration.area_mm2))
         # the forest correction has learned the usual proportions and would bias the size
         uncorrected = replace(self, model=replace(self.model, corrector=None))
-        for _ in range(_SIZE_PASSES):
+        for _ in range(8):  # each corrects about a third of the error
             estimates = uncorrected.estimate(sample, scene, guess)
             if not estimates.found.any():
                 raise EstimationError(

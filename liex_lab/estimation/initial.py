@@ -24,18 +24,10 @@ from liex_lab.scene.height_maps import moment_columns
 
 Array = NDArray[np.float64]
 
-# of the body length: initial distance of the base from the centroid, towards its own end
-_BEHIND = 0.42
-_HIGH = 0.2  # of the body length: initial height of the base above the floor
-# of the body length: initial depth of the base below the mean height, in camera view
-_LOW = 0.05
 _JITTER = (
     0.12,
     0.7,
 )  # rad: spread of the headings of a long thin animal, and the increase for a round one
-_JITTER_RISE = 0.03  # rad, at most
-_JITTER_MM = 2.0  # of the positions, for an animal of the reference length
-_SCALED_BY = 0.1  # largest relative change of all bones of a start in the paper
 
 
 def draw_starts(rng: np.random.Generator, n_images: int, n_candidates: int) -> Array:
@@ -86,29 +78,30 @@ def start_poses(
     home_length = skeleton.length
     opposite = np.arange(k) % 2
     if method.axis_start:
-        jitter = _JITTER_MM * round(home_length / REFERENCE_MM, 6)
+        jitter = 2.0 * round(home_length / REFERENCE_MM, 6)
         spread = _JITTER[0] + _JITTER[1] * (blob.sd_across / np.maximum(blob.sd_along, 1e-6)) ** 2
         heading = blob.angle[:, None] + np.pi * opposite + spread[:, None] * starts[..., 0]
         scale = size.copy()
         base_at_front = skeleton.offsets[skeleton.next_joint[0], 0] < 0
-        behind = _BEHIND * home_length * scale * (-1.0 if base_at_front else 1.0)
+        # the base is this far from the centroid, towards its own end
+        behind = 0.42 * home_length * scale * (-1.0 if base_at_front else 1.0)
         direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         position[..., :2] = (
             centre - behind[..., None] * direction + jitter * scale[..., None] * starts[..., 1:3]
         )
-        high = _HIGH * home_length * scale
-        low = mean_height - _LOW * home_length * scale
+        high = 0.2 * home_length * scale  # above the floor
+        low = mean_height - 0.05 * home_length * scale  # in camera view, below the mean height
         position[..., 2] = low if method.camera_view else high
     else:
         heading = np.pi * starts[..., 3]
         # the quantile of a standard normal number is uniform
-        scale = size * (1.0 + _SCALED_BY * (2.0 * ndtr(starts[..., 1]) - 1.0))
+        scale = size * (1.0 + 0.1 * (2.0 * ndtr(starts[..., 1]) - 1.0))
         position[..., :2] = centre
         position[..., 2] = mean_height
     rotation = _turned(heading, 0, 1)
     if method.axis_start and method.camera_view:
         slope = np.arctan(blob.slope[:, None]) * (1.0 - 2.0 * opposite)
-        rise = slope + _JITTER_RISE * starts[..., 3]
+        rise = slope + 0.03 * starts[..., 3]
         rotation = rotation @ _turned(rise, 0, 2)
         # the base is ahead of or behind the middle of the animal
         position[..., 2] -= behind * np.sin(rise)
@@ -130,7 +123,6 @@ def _turned(angle: Array, a: int, b: int) -> Array:
 
 
 N_DIRECTIONS = 2  # both directions along the animal's long axis
-_SIZE_SD = 0.08  # standard deviation (log) of a session's estimated size
 
 
 def views_along_axis(
@@ -194,7 +186,8 @@ def train_proposals(
     """
     assert method.proposals is not None
     truth = data.truth
-    guess = data.size * np.exp(_SIZE_SD * rng.standard_normal(len(data.size)))
+    # as a session's estimated size errs
+    guess = data.size * np.exp(0.08 * rng.standard_normal(len(data.size)))
     samples, frame, centre = views_along_axis(data.images, guess, method.proposal_reach_mm)
     i = samples.image
     turned = np.swapaxes(frame, 1, 2) @ truth.rotations[i, 0]

@@ -50,8 +50,6 @@ _DAMAGE = (
     zipfile.BadZipFile,
     lzma.LZMAError,
 )
-# date of every file in the archive, so that equal models are equal bytes
-_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 @dataclass(frozen=True)
@@ -160,7 +158,8 @@ class Model:
             for name, values in arrays.items():
                 content = io.BytesIO()
                 np.lib.format.write_array(content, values, allow_pickle=False)
-                entry = zipfile.ZipInfo(f"{name}.npy", _EPOCH)
+                # a fixed date, so that equal models are equal bytes
+                entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
                 entry.compress_type = zipfile.ZIP_LZMA
                 archive.writestr(entry, content.getvalue())
         return packed.getvalue()
@@ -178,7 +177,7 @@ class Model:
         """
         try:
             # opened here, for numpy leaves a damaged archive open
-            check_npz(path, _MOST_BYTES)
+            check_npz(path, 1 << 30)  # unpacked, ten times the largest bundled one
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 head = json.loads(archive["head"].tobytes())
                 if head.get("schema", 0) > SCHEMA:
@@ -277,7 +276,7 @@ def check_model(model: Model) -> None:
         ("expectation", model.expectation, (1, N_CLUES + n_refined, 1)),
         ("pruner", model.pruner, (1, N_SCALARS, 1)),
         ("corrector", model.corrector, (j, N_SCALARS + 1, 3 * j)),
-        ("proposals", model.proposals, (1, N_SCALARS + 1, _N_PROPOSED)),
+        ("proposals", model.proposals, (1, N_SCALARS + 1, 12)),  # a rotation matrix and a position
     ]
     for name, forest, sizes in expected:
         if forest is not None:
@@ -317,7 +316,7 @@ def _check_numbers(where: str, values: Any) -> None:
     """Raise ValueError for a number, at any depth of tables and lists, that is NaN, infinite or
     implausibly large.
     """
-    if isinstance(values, float | int) and not abs(values) <= _HUGE:
+    if isinstance(values, float | int) and not abs(values) <= 1e12:
         raise ValueError(f"{where} contains the number {values}")
     inner = getattr(values, "__dict__", values)
     if isinstance(inner, dict):
@@ -328,8 +327,6 @@ def _check_numbers(where: str, values: Any) -> None:
         _check_numbers(where, value)
 
 
-_HUGE = 1e12
-_MOST_BYTES = 1 << 30  # of a model unpacked: ten times the largest bundled one
 _MOST = 10_000
 # least value of each count
 _COUNTS = {
@@ -341,7 +338,6 @@ _COUNTS = {
     "refine_steps": 0,
     "refined": 0,
 }
-_N_PROPOSED = 12  # a rotation matrix and a position
 _LAYER = "facing_"
 _LAYER_PARTS = ("weights", "bias")
 

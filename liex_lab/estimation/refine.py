@@ -52,13 +52,8 @@ from liex_lab.scene.height_maps import mm_per_px
 
 Array = NDArray[np.float64]
 
-_ROBUST_MM = 10.0  # in tenths of the balls' usual radius: a reading this far off counts a quarter
-_BESIDE = 0.3  # weight of a ball outside the animal relative to a reading
-# steps of all poses, and number of the best poses that continue
-_FIRST_STEPS = 1
-_GO_ON = 2
-_BESIDE_MM = 4.0  # in that unit: cost in the choice if all balls were outside the animal
-# cost of leaving the pose of the regressors, in squares of that unit: a radian of the base, a unit
+_FIRST_STEPS = 1  # of all poses
+# cost of leaving the pose of the regressors, in squares of the unit: a radian of the base, a unit
 # of its position, of log scale, and a radian of a joint
 _PRIOR = np.array([1e4, 0.5, 1e4, 60.0])
 
@@ -118,8 +113,9 @@ class Refiner:
         unit = self.body.unit_mm * size
         root = SE3(pose.root.rotation.copy(), pose.root.translation.copy())
         moved = Pose(root, pose.angles.copy(), pose.scale.copy())
+        # a reading 10 units off counts a quarter, a ball outside the animal 0.3 of a reading
         weights = kernels.ResidualWeights(
-            _ROBUST_MM * unit, _BESIDE, *(_PRIOR * np.array([unit**2, 1.0, unit**2, unit**2]))
+            10.0 * unit, 0.3, *(_PRIOR * np.array([unit**2, 1.0, unit**2, unit**2]))
         )
         in_parallel(
             kernels.refine_all,
@@ -178,8 +174,9 @@ class Refiner:
             fit = self.fit(moved, images, size)
             off = fit[..., residual_kernels.OUT_OF] + fit[..., residual_kernels.APART]
             beside = fit[..., residual_kernels.BESIDE] / residual_kernels.SHARE_UNIT
-            off_mm = off / residual_kernels.MM_UNIT + _BESIDE_MM * beside
-            order = rows, np.argsort(off_mm, axis=1, kind="stable")[:, :_GO_ON]
+            # 4 units if all balls were outside the animal
+            off_mm = off / residual_kernels.MM_UNIT + 4.0 * beside
+            order = rows, np.argsort(off_mm, axis=1, kind="stable")[:, :2]
             kept = moved[order]
             fit = fit[order]
         return kept[:, 0], fit[:, 0]
@@ -192,14 +189,7 @@ _MOST_SHARE = 0.08  # of the length: readings farther from the back than this ar
 # share of the frames used for the size: those that show most of the animal's far end
 SURE_SHARE = 1 / 3
 N_OTHERS = 15  # clues that are not of one joint
-_RIDGE = 1e-2  # of the features' variance
-_LEAST_SPREAD = 1e-6
 _TAIL = 0.01  # quantile of a clue in training at which it is clipped
-# a product's last bits depend on the batch size, and a frame's pose must not
-_DECIMALS = 12
-# of the length, and in logarithms: poses with larger errors are excluded
-_SLID_SHARE = 0.1
-_SIZE_LOG = 0.25
 
 
 @dataclass(frozen=True)
@@ -246,12 +236,12 @@ class RidgeCorrection:
         slide = np.sum(error * tangents(joints), axis=-1).mean(axis=1)
         grown = np.log(true_size / size)
         labels = np.column_stack([error[..., 2], slide, grown])
-        good = np.linalg.norm(error, axis=-1).mean(axis=1) < _SLID_SHARE
-        good &= np.abs(grown) < _SIZE_LOG
+        good = np.linalg.norm(error, axis=-1).mean(axis=1) < 0.1
+        good &= np.abs(grown) < 0.25
         bounds = np.quantile(features[good], [_TAIL, 1.0 - _TAIL], axis=0)
         # from all of them: those that show its far end best were mostly underestimated in size
         x = np.clip(features[good], *bounds)
-        weights, constant = ridge_regression(x, labels[good], _RIDGE, _LEAST_SPREAD)
+        weights, constant = ridge_regression(x, labels[good], ridge=1e-2, least_spread=1e-6)
         weights[0] = constant  # the first feature is 1
         return RidgeCorrection(skeleton, np.column_stack([*bounds, weights]))
 
@@ -273,7 +263,8 @@ class RidgeCorrection:
         joints = pose.joints(skeleton)
         features = clues(skeleton, pose, joints, images, np.full(len(joints), size))
         clipped = np.clip(features, self.table[:, 0], self.table[:, 1])
-        correction = (clipped @ self.table[:, 2:]).round(_DECIMALS)
+        # a product's last bits depend on the batch size, and a frame's pose must not
+        correction = (clipped @ self.table[:, 2:]).round(12)
         length = skeleton.length * size
         moved = joints + length * correction[:, -2, None, None] * tangents(joints)
         moved[..., 2] += length * correction[:, :-2]
@@ -385,17 +376,10 @@ def clues(skeleton: Skeleton, pose: Pose, joints: Array, images: ImageSet, size:
 _ALONG_MM = 50.0
 _ACROSS_MM = 25.0
 _STEP_MM = 2.5
-_HEIGHT_MM = 10.0  # unit of the network's input
 # smaller differences between both directions' scores are unsure, at the reference length
 UNSURE_MM = 15.0
-_MM_PER_LOGIT = 4.0  # weight of the network's output relative to scores, at the reference length
 _MOST_LOGIT = 6.0
-_LOGIT_DECIMALS = 6
-_HIDDEN = (128, 32)
-_EPOCHS = 15
-_BATCH = 256
 _RATE = 1e-3
-_WEIGHT_DECAY = 1e-2
 
 
 @dataclass(frozen=True)
@@ -424,12 +408,12 @@ class HeadTailClassifier:
         layers = descend(
             inputs,
             np.concatenate([right, right]),
-            _HIDDEN,
-            epochs=_EPOCHS,
-            batch=min(_BATCH, len(inputs)),
+            (128, 32),
+            epochs=15,
+            batch=min(256, len(inputs)),
             rate=_RATE,
             least_rate=1e-2 * _RATE,
-            weight_decay=_WEIGHT_DECAY,
+            weight_decay=1e-2,
             seed=seed,
         )
         # rounded to the precision of the model file
@@ -455,7 +439,7 @@ class HeadTailClassifier:
         views = np.concatenate([resampled, resampled[:, :, ::-1]])
         flat = views.reshape(len(views), -1).astype(np.float64)
         both = self.network.logits(flat).reshape(2, -1)
-        return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0).round(_LOGIT_DECIMALS)
+        return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0).round(6)
 
     def judged(self, images: ImageSet, positions: Array, scores: Array, size: float) -> Array:
         """Adjust the candidates' scores by the network if the metric is unsure of the direction.
@@ -480,7 +464,7 @@ class HeadTailClassifier:
             return scores
         poses = np.concatenate([positions[doubted, k[doubted]] for k in (best, opposite)])
         first, second = np.split(self.logits(images[np.tile(doubted, 2)], poses, size), 2)
-        total = ahead[doubted] + _MM_PER_LOGIT * unit * (first - second)
+        total = ahead[doubted] + 4.0 * unit * (first - second)
         wrong = doubted[total < 0]
         behind = (ahead[doubted] - total)[total < 0]
         judged = scores.copy()
@@ -545,4 +529,4 @@ def laid_along(
         across,
         out,
     )
-    return (out / (_HEIGHT_MM * unit * size[:, None, None])).astype(np.float32)
+    return (out / (10.0 * unit * size[:, None, None])).astype(np.float32)

@@ -36,11 +36,7 @@ from liex_lab.scene.height_maps import mm_per_px, moment_columns
 Array = NDArray[np.float64]
 
 LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
-_PIXEL_LOG_UNIT = 500.0  # of a scalar: a threshold is an integer
-# at the reference length: the least expected error, and the score of the opposite direction if no
-# candidate has it
-LEAST_MM = 0.1
-_NO_OPPOSITE_MM = 40.0
+LEAST_MM = 0.1  # least expected error, at the reference length
 
 
 @dataclass(frozen=True)
@@ -152,7 +148,8 @@ def choose(
     # of three equal components, see columns.json
     sd_mm = expected[:, None] * share / np.sqrt(3.0)
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
-    no_opposite_mm = _NO_OPPOSITE_MM * skeleton.relative_size
+    # the score of the opposite direction if no candidate has it
+    no_opposite_mm = 40.0 * skeleton.relative_size
     doubts = _doubts(positions, scores, mean, score, size, no_opposite_mm)
     return Chosen(
         pose,
@@ -399,5 +396,6 @@ def pose_samples(pose: Pose, model: Model, images: ImageSet, size: float) -> Sam
     )
     samples = model.cascade.samples(images, candidates, list(range(model.skeleton.n_joints)))
     pixel = mm_per_px(images.crop_cameras) / size
-    scalars = np.column_stack([samples.scalars, _PIXEL_LOG_UNIT * np.log(pixel)]).astype(np.float32)
+    # a threshold is an integer
+    scalars = np.column_stack([samples.scalars, 500.0 * np.log(pixel)]).astype(np.float32)
     return replace(samples, scalars=scalars)

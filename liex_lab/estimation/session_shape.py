@@ -38,7 +38,6 @@ Array = NDArray[np.float64]
 N_STATIONS = 22
 N_LATERAL = 24
 _FROM, _TO = -0.10, 1.10  # along the chain: a body extends past both its ends
-_REACH = 1.75  # of the default body's half width: the broadest animal is narrower
 _HARDLY = 0.15  # of the frames show a cell: rarer readings are other objects and torn edges
 _PLACES = (
     0.05,
@@ -46,10 +45,7 @@ _PLACES = (
     0.65,
     0.85,
 )  # over the half width: positions at which the back's decline is measured
-_BACKS = 8  # groups of stations for the height of the back
-_FALLS = 6  # and for its decline
 _MARGIN = 2  # stations at either end that are past the body
-_LEAST_WIDTH = 0.05  # of the default body's: thinner, a station shows nothing
 
 
 def cross_sections(
@@ -80,7 +76,8 @@ def cross_sections(
     points = np.ascontiguousarray(joints[:, bone] + share * along)
     sideways = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     sideways /= np.maximum(np.linalg.norm(sideways, axis=-1, keepdims=True), 1e-9)
-    reach = _REACH * float(BodyShape.default(skeleton).half_width.max()) * size
+    # the broadest animal is narrower
+    reach = 1.75 * float(BodyShape.default(skeleton).half_width.max()) * size
     lateral = (np.arange(N_LATERAL) + 0.5) / N_LATERAL * reach
     covered = np.empty((n, N_STATIONS, N_LATERAL))
     height = np.empty_like(covered)
@@ -102,11 +99,9 @@ def _grouped(values: Array, weight: Array, n: int) -> Array:
 
 
 PLACES = (0.1, 0.25, 0.4, 0.6, 0.8)  # of the body's length
-_FOLDER = Path(__file__).with_name("shapes")
 _RIDGE = 0.03  # of the clues' variance
 _FOLDS = 5
 _TAIL = 0.005  # quantile of a clue in training at which it is clipped
-_DECIMALS = 9  # a product's last bits depend on the machine
 
 
 def session_clues(
@@ -129,7 +124,8 @@ def session_clues(
     """
     covered, across, step = cross_sections(skeleton, pose, heights, crop_cameras, size)
     width = covered.sum(axis=1) * step
-    least = _LEAST_WIDTH * BodyShape.default(skeleton).half_width.max() / skeleton.length
+    # thinner, a station shows nothing
+    least = 0.05 * BodyShape.default(skeleton).half_width.max() / skeleton.length
     lateral = (np.arange(N_LATERAL) + 0.5) * step
     for t in range(1, N_LATERAL):  # cells that are rarely visible continue the back level
         across[:, t] = np.where(covered[:, t] < _HARDLY, across[:, t - 1], across[:, t])
@@ -140,8 +136,8 @@ def session_clues(
     return np.concatenate(
         [
             width,
-            _grouped(back[:, :1], width, _BACKS),
-            _grouped(back[:, :1] - back[:, 1:], width, _FALLS),
+            _grouped(back[:, :1], width, 8),
+            _grouped(back[:, :1] - back[:, 1:], width, 6),
             [torn.mean()],
             [float(np.median(mm_per_px(crop_cameras))) / (skeleton.length * size)],
             [float(np.log(np.median(pose.scale) / size))],
@@ -175,7 +171,7 @@ class ShapePrior:
     @cache
     def of(name: str) -> ShapePrior | None:
         """The prior of an animal by the name of its skeleton; None if absent."""
-        path = _FOLDER / f"{name}.npz"
+        path = Path(__file__).with_name("shapes") / f"{name}.npz"
         return ShapePrior.load(path) if path.is_file() else None
 
     @staticmethod
@@ -232,7 +228,8 @@ class ShapePrior:
             (..., K).
         """
         x = np.clip(clues, *self.bounds)
-        return np.asarray((x @ self.table[:-1] + self.table[-1]).round(_DECIMALS))
+        # a product's last bits depend on the machine
+        return np.asarray((x @ self.table[:-1] + self.table[-1]).round(9))
 
 
 def labels_of(offset: Array, width: Array, height: Array) -> Array:

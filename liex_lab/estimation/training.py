@@ -58,12 +58,6 @@ from liex_lab.scene.height_maps import HeightMaps, crop_columns
 Array = NDArray[np.float64]
 ProgressCallback = Callable[[float, str], None]  # completed share, name of the step
 
-# at the reference length: larger errors are capped, as their differences do not matter
-_ERROR_CAP_MM = 30.0
-_FEW_JOINTS = 3
-_PRUNER_SHRINKAGE = 0.3
-_SIZE_SD = 0.08  # standard deviation (log) of a session's estimated size
-
 
 def start_candidates(
     data: TrainingSet,
@@ -91,7 +85,8 @@ def start_candidates(
     starts = draw_starts(rng, m, k)
     size = np.ones((m, k))
     if method.session_size:
-        size = data.size[:, None] * np.exp(_SIZE_SD * rng.standard_normal((m, k)))
+        # as a session's estimated size errs
+        size = data.size[:, None] * np.exp(0.08 * rng.standard_normal((m, k)))
     rotation, position, scale = start_poses(data.images.moments, starts, size, skeleton, method)
     if proposals is not None:
         forest, in_bag = proposals
@@ -203,7 +198,7 @@ def perturbed_truth(
         skeleton, image, base.rotation, base.translation, data.truth.scale[image], size
     )
     # a long chain bends no more as a whole than a short one
-    bent = 0.35 * np.sqrt(min(1.0, _FEW_JOINTS / max(1, len(skeleton.solved) - 1)))
+    bent = 0.35 * np.sqrt(min(1.0, 3 / max(1, len(skeleton.solved) - 1)))
     for joint in range(1, skeleton.n_joints):
         cascade.place(candidates, joint)
         parent = skeleton.parents[joint]
@@ -249,7 +244,7 @@ def train_metric(
 
 def _capped_error(cascade: Cascade, candidates: Candidates, truth: Truth) -> NDArray[np.float32]:
     """Labels (n, 1) of both metrics: the joint error, mm at home size, capped if gross."""
-    cap = _ERROR_CAP_MM * cascade.skeleton.relative_size
+    cap = 30.0 * cascade.skeleton.relative_size
     return np.minimum(joint_error(candidates, truth), cap)[:, None].astype(np.float32)
 
 
@@ -275,20 +270,13 @@ def train_pruner(
         return None
     samples = cascade.samples(data.images, candidates, [0])
     labels = _capped_error(cascade, candidates, data.truth)
-    return boost_forest(samples, labels, plan, _PRUNER_SHRINKAGE, rng).quantised()
+    return boost_forest(samples, labels, plan, 0.3, rng).quantised()
 
 
 # Stacking on held-out images: corrections, head-tail classifier and error calibration of a model.
 
 
-_CAP_MM = 25.0  # at the reference length; a lost pose must not dominate the calibration
-# standard deviation (log) of a session's size, estimated over many frames with the ridge
-# correction, and without
-_TRIAL_SIZE_SD = 0.05
-_SETTLED_SIZE_SD = 0.02
-_GUESS_SD = 0.08
-_DOUBTFUL_SHARE = 0.97  # of ordinary images are trusted
-_PER_GROUP = 50  # images share a size guess, as the frames of a recording do
+_TRIAL_SIZE_SD = 0.05  # (log) of a session's size, estimated over many frames
 _EXPECTATION = GrowthPlan(
     n_trees=120,
     max_depth=6,
@@ -300,9 +288,6 @@ _EXPECTATION = GrowthPlan(
     bag_share=0.5,
 )
 _SHRINKAGE = 0.12
-# at the reference length: larger errors are gross
-_CORRECTED_MM = 12.0
-_CORRECTION_SHRINKAGE = 0.1
 _FOLDS = 4
 
 
@@ -335,7 +320,7 @@ def _choices(
     animals = np.flatnonzero(data.animal)
     order = animals[np.argsort(data.size[animals], kind="stable")]
     estimator = PoseEstimator(model)
-    for rows in np.array_split(order, max(1, len(order) // _PER_GROUP)):
+    for rows in np.array_split(order, max(1, len(order) // 50)):  # images share a size guess
         size = float(np.median(data.size[rows]) * np.exp(size_sd * rng.standard_normal()))
         size = size if model.method.session_size else 1.0
         images = data.images[rows]
@@ -364,7 +349,8 @@ def run_on(model: Model, data: TrainingSet, rng: np.random.Generator) -> Trial:
     Returns:
         Scores, spreads, errors and features of the choices, in order of the animals' size.
     """
-    size_sd = _TRIAL_SIZE_SD if model.settler is None else _SETTLED_SIZE_SD
+    # the ridge correction estimates it better
+    size_sd = _TRIAL_SIZE_SD if model.settler is None else 0.02
     columns = []
     for rows, detection, size, chosen in _choices(model, data, rng, size_sd):
         off = chosen.pose.joints(model.skeleton) - data.truth.positions[rows]
@@ -396,14 +382,14 @@ def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) ->
         frames = chosen.pose.frames(skeleton)
         off = data.truth.positions[rows] - frames.translation
         error = np.linalg.norm(off, axis=-1).mean(axis=1)
-        near = error < _CORRECTED_MM * skeleton.relative_size * size
+        near = error < 12.0 * skeleton.relative_size * size  # larger errors are gross
         samples = pose_samples(chosen.pose, model, detection.images, size)
         samples = replace(samples, heights=data.images.heights, image=rows.astype(np.int32))
         parts.append(samples[np.flatnonzero(near)])
         move = np.einsum("nji,nkj->nki", frames.rotation[:, 0], off) / size
         moves.append(move.reshape(len(move), -1)[near])
     labels = np.concatenate(moves).astype(np.float32)
-    forest = boost_forest(Samples.join(parts), labels, plan, _CORRECTION_SHRINKAGE, rng)
+    forest = boost_forest(Samples.join(parts), labels, plan, 0.1, rng)
     return replace(model, corrector=forest.quantised())
 
 
@@ -417,7 +403,7 @@ def with_settler(model: Model, data: TrainingSet, rng: np.random.Generator) -> M
     """
     if not model.method.settle:
         return model
-    groups = list(_choices(model, data, rng, _GUESS_SD))
+    groups = list(_choices(model, data, rng, 0.08))
     rows = np.concatenate([rows for rows, *_ in groups])
     sizes = np.concatenate([np.full(len(rows), size) for rows, _, size, _ in groups])
     pose = Pose.join([chosen.pose for *_, chosen in groups])
@@ -483,7 +469,7 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     """
     trial = run_on(model, data, rng)
     error = trial.joint_error.mean(axis=1)
-    capped = np.minimum(error, _CAP_MM * model.skeleton.relative_size)
+    capped = np.minimum(error, 25.0 * model.skeleton.relative_size)  # a lost pose must not dominate
     target = (LOG_UNIT * np.log(capped))[:, None].astype(np.float32)
     n = len(error)
     fold = rng.permutation(n) % _FOLDS
@@ -509,7 +495,7 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
         spread_slope=float(line[2]),
         quantiles=(float(low), float(high)),
         joint_share=tuple((np.median(trial.joint_error, axis=0) / np.median(error)).tolist()),
-        doubtful_mm=float(np.quantile(predicted, _DOUBTFUL_SHARE)),
+        doubtful_mm=float(np.quantile(predicted, 0.97)),  # of ordinary images are trusted
         area_mm2=model.calibration.area_mm2,
         logarithmic=True,
     )

@@ -16,13 +16,7 @@ import numpy as np
 from liex_lab.runtime.kernels import inner_kernel, kernel
 
 BLOCK = 4  # pixels per side; blobs are connected in blocks
-# only every other row is read: reading an image takes longer than processing it
-_ROW_STEP = 2
-_MIN_IN_BLOCK = 3  # of the 8 inspected pixels
 MAX_BLOBS = 32
-_MIN_UNREAD = 9  # of 16 pixels
-_SLOPE_PASSES = 5
-_LEVEL_PASSES = 3
 
 
 class Blob(NamedTuple):
@@ -48,7 +42,6 @@ class Blob(NamedTuple):
 
 
 N_BLOB = len(Blob._fields)
-_BLOB_N_PX = Blob._fields.index("n_px")
 
 
 class BlobMoments(NamedTuple):
@@ -85,18 +78,6 @@ N_PX, AREA, VOLUME, X, Y, ANGLE, SD_ALONG, SD_ACROSS, SLOPE = range(N_MOMENTS)
 def unpack_blob(packed):
     """The record of one component's packed counts (N_BLOB,)."""
     return Blob(packed[0], packed[1], packed[2], packed[3], packed[4], packed[5], packed[6])
-
-
-@inner_kernel()
-def pack_blob(blob, packed):
-    """Write a component's record into its row (N_BLOB,) of the packed counts."""
-    packed[0] = blob.n_px
-    packed[1] = blob.first_row
-    packed[2] = blob.last_row
-    packed[3] = blob.first_column
-    packed[4] = blob.last_column
-    packed[5] = blob.depth_sum
-    packed[6] = blob.n_on_floor
 
 
 @inner_kernel()
@@ -137,7 +118,7 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
     hits = np.empty(n_columns * BLOCK, np.uint8)
     for i in range(n_rows):
         hits[:] = 0
-        for r in range(0, BLOCK, _ROW_STEP):
+        for r in range(0, BLOCK, 2):  # reading takes longer than processing
             row_depth = depth[i * BLOCK + r]
             row_limit = limit[i * BLOCK + r]
             for c in range(hits.size):
@@ -147,7 +128,7 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
             count = 0
             for c in range(BLOCK):
                 count += hits[j * BLOCK + c]
-            labels[i, j] = -2 if count >= _MIN_IN_BLOCK else -1
+            labels[i, j] = -2 if count >= 3 else -1  # of the 8 inspected pixels
     n_blobs = 0
     stack = np.empty((n_rows * n_columns, 3), np.int32)
     for i in range(n_rows):
@@ -155,13 +136,12 @@ def label_blobs(depth, limit, on_floor, bridge, labels, blobs):
             if labels[i, j] != -2:
                 continue
             if n_blobs == MAX_BLOBS:
-                slot = int(np.argmin(blobs[:, _BLOB_N_PX]))
+                slot = int(np.argmin(blobs[:, 0]))  # that of the fewest pixels
                 forget(labels, slot)
             else:
                 slot = n_blobs
                 n_blobs += 1
-            blob = _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack)
-            pack_blob(blob, blobs[slot])
+            _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, blobs[slot])
     return n_blobs
 
 
@@ -231,12 +211,12 @@ def _is_unread(depth, row, column):
     for v in range(row * BLOCK, row * BLOCK + BLOCK):
         for u in range(column * BLOCK, column * BLOCK + BLOCK):
             n += depth[v, u] == 0
-    return n >= _MIN_UNREAD
+    return n >= 9  # of 16 pixels
 
 
 @inner_kernel()
-def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack):
-    """Flood fill: blocks connected with (i, j) get the label `slot`; their counts, a `Blob`."""
+def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, packed):
+    """Flood fill: blocks connected with (i, j) get the label `slot`, and `packed` their counts."""
     n_px = 0
     first_row = i
     last_row = i
@@ -279,7 +259,13 @@ def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack):
                     stack[top, 1] = b
                     stack[top, 2] = 0 if on else gone + 1
                     top += 1
-    return Blob(n_px, first_row, last_row, first_column, last_column, depth_sum, n_on_floor)
+    packed[0] = n_px
+    packed[1] = first_row
+    packed[2] = last_row
+    packed[3] = first_column
+    packed[4] = last_column
+    packed[5] = depth_sum
+    packed[6] = n_on_floor
 
 
 @inner_kernel()
@@ -428,7 +414,7 @@ def level_heights(raw, behind_mm):
     """
     mean = 0.0
     reach = np.inf
-    for _ in range(_LEVEL_PASSES):
+    for _ in range(3):
         total = 0.0
         n = 0
         for r in range(raw.shape[0]):
@@ -611,7 +597,7 @@ def back_slope(heights, origin, step, intrinsics, distance, moments):
     level = 0.0
     slope = 0.0
     scale = np.inf
-    for _ in range(_SLOPE_PASSES):
+    for _ in range(5):
         sw = 0.0
         sx = 0.0
         sh = 0.0

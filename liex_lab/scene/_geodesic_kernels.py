@@ -25,15 +25,9 @@ MAX_SURFACES = 24
 MAX_TIPS = 256
 # of a home-sized hand: distance of its points and of the start of its arm from its middle
 AROUND_MM = 190.0
-_MIN_IN_BLOCK = 5
-_THICK_MM = 25.0  # readings this far behind the nearest of a block belong to another surface
 _JUMP_MM = 50.0  # neighbouring blocks differ by less on one surface
 # of a home-sized hand: least persistence of an end, which an elbow does not reach
 _STICKS_OUT_MM = 90.0
-# each further multiple of that persistence counts as being nearer by this, up to a maximum
-_WORTH_MM = 60.0
-_MOST_OUT = 3.0
-_APART = 0.6  # of that radius: ends nearer to each other are the same hand
 _MARGIN = 2  # blocks: many cameras have no readings along the image border
 # columns of a geodesic extremum: rank (depth mm, reduced for large persistence); block row; block
 # column; depth mm
@@ -86,10 +80,10 @@ def block_depths(depth, near, far, blocks):
                 for r in range(i * BLOCK, i * BLOCK + BLOCK):
                     for c in range(j * BLOCK, j * BLOCK + BLOCK):
                         z = depth[r, c]
-                        if near < z < second + _THICK_MM:
+                        if near < z < second + 25.0:  # farther is another surface
                             total += z
                             n += 1
-            blocks[i, j] = total / n if n >= _MIN_IN_BLOCK else 0.0
+            blocks[i, j] = total / n if n >= 5 else 0.0
 
 
 @kernel()
@@ -356,7 +350,8 @@ def _note(tips, n_tips, z, out, block):
     """Add an extremum at depth z mm whose persistence is `out` times the required one."""
     if n_tips == MAX_TIPS:
         return n_tips
-    tips[n_tips, END_RANK] = z - _WORTH_MM * min(out, _MOST_OUT)
+    # each multiple of the required persistence counts as being nearer by 60 mm, up to three
+    tips[n_tips, END_RANK] = z - 60.0 * min(out, 3.0)
     tips[n_tips, END_ROW] = block[0]
     tips[n_tips, END_COLUMN] = block[1]
     tips[n_tips, END_DEPTH] = z
@@ -416,7 +411,7 @@ def nearest_ends(blocks, labels, surfaces, size, intrinsics, chosen):
             end = chosen[k]
             a, b, c = point_of_block(blocks, int(end[END_ROW]), int(end[END_COLUMN]), intrinsics)
             off = np.sqrt((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2)
-            own &= off > _APART * AROUND_MM * size
+            own &= off > 0.6 * AROUND_MM * size  # nearer to each other, they are the same hand
         if own:
             chosen[n_chosen] = tip
             n_chosen += 1

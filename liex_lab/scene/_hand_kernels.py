@@ -29,18 +29,7 @@ from liex_lab.scene._geodesic_kernels import (
     relabel,
 )
 
-# separates rendered hands from elbows, chests and heads by logistic regression, in units of the
-# first: the logarithm of circumference^2 over area, which fingers make large
-_AREA_LOG_MM2 = 9.55  # of a home-sized hand
-_PER_AREA = 0.55  # weight of the squared difference
-_PER_BORDER = 0.6  # weight of the share along the image border
-# weight of its width behind the cut
-_WRIST_MM = 50.0
-_WIDE_MM = 100.0
-_PER_WIDTH = 0.25
-_MOST_WIDTHS = 4.0
-_MARGIN = 2  # blocks
-_ACROSS = ((-1, 0), (1, 0), (0, -1), (0, 1))
+_WRIST_MM = 50.0  # of a home-sized hand: the arm is inspected this far behind the cut
 
 
 class HandFind(NamedTuple):
@@ -94,8 +83,8 @@ def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
         area += side * side
         depth += blocks[i, j]
         n += 1
-        on_border += min(i, j, n_rows - 1 - i, n_columns - 1 - j) < _MARGIN
-        for a, b in _ACROSS:
+        on_border += min(i, j, n_rows - 1 - i, n_columns - 1 - j) < 2
+        for a, b in ((-1, 0), (1, 0), (0, -1), (0, 1)):
             r = i + a
             c = j + b
             inside = 0 <= r < n_rows and 0 <= c < n_columns
@@ -104,9 +93,11 @@ def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
     relabel(labels, surface)
     area = max(area, 1.0)
     n = max(n, 1)
-    width = min(behind / (_WRIST_MM * _WIDE_MM * size * size), _MOST_WIDTHS)
-    unlike = _PER_AREA * (np.log(area / (size * size)) - _AREA_LOG_MM2) ** 2
-    return depth / n, unlike + _PER_BORDER * on_border / n + _PER_WIDTH * width - np.log(
+    width = min(behind / (_WRIST_MM * 100.0 * size * size), 4.0)
+    # weights of size, border and wrist separate rendered hands from elbows, chests and heads by
+    # logistic regression, in units of the last term, which fingers make large
+    unlike = 0.55 * (np.log(area / (size * size)) - 9.55) ** 2
+    return depth / n, unlike + 0.6 * on_border / n + 0.25 * width - np.log(
         max(around, 1.0) ** 2 / area
     )
 
@@ -130,20 +121,7 @@ def _behind_cut(point, found, size):
     return -_WRIST_MM * size < along <= 0.0 and off < (1.4 * AROUND_MM * size) ** 2
 
 
-# of a home-sized hand: radius of the first estimate at the end of a surface
-_TIP_MM = 60.0
-_MOST_ENDS = 8  # inspected ends
-# penalty for being farther away than another end, in `unlikeness`
-_PER_MM_BEHIND = 0.012
-_MOST_BEHIND_MM = 800.0
-# largest excess in unlikeness of a second candidate
-_AS_LIKE = 1.0
-_LEAST_MM2 = 2500.0  # no hand is smaller
-_LENGTH_MM = 185.0  # of a home-sized hand
-_SHELL = 0.75  # the outer part of the sphere around it, where only the arm is
-_SHELL_MM2 = 900.0
 _BIN_MM = 5.0
-_RIM_MM = 45.0  # pixels next to a block of the hand belong to it within this depth
 
 
 # columns of a point of a surface: x, y, z mm, distance from the middle mm, block row, block column
@@ -203,7 +181,7 @@ def locate(blocks, labels, surface, tip, size, intrinsics):
     base = 0.0
     near = np.empty((len(surface.cells), _N_POINT))
     # the step of mean shift, before any cut
-    tips = near[: _within(surface, _TIP_MM * size, middle, near)]
+    tips = near[: _within(surface, 60.0 * size, middle, near)]  # of a home-sized hand, mm
     _beyond(tips, middle, fingers, cut, labels, False)
     for step in range(3):
         points = near[: _within(surface, around, middle, near)]
@@ -247,13 +225,13 @@ def _away_from_arm(points, size, focal2, middle, fingers):
         fingers[k] = 0.0
     for n in range(len(points)):
         off = points[n, _POINT_DISTANCE]
-        if off > _SHELL * AROUND_MM * size:
+        if off > 0.75 * AROUND_MM * size:  # only the arm is this far out
             w = BLOCK * BLOCK * points[n, _POINT_Z] * points[n, _POINT_Z] / focal2
             shell += w
             for k in range(3):
                 fingers[k] -= w * (points[n, k] - middle[k]) / off
     norm = np.sqrt(fingers[0] ** 2 + fingers[1] ** 2 + fingers[2] ** 2)
-    has_arm = shell > _SHELL_MM2 * size * size and norm > 0.3 * shell
+    has_arm = shell > 900.0 * size * size and norm > 0.3 * shell
     for k in range(3):
         fingers[k] = fingers[k] / norm if has_arm else 0.0
     return has_arm
@@ -276,7 +254,7 @@ def _wrist(points, size, focal2, middle, fingers):
     while b > 0 and tip < 100.0 * size * size:
         tip += along[b]
         b -= 1
-    return b * _BIN_MM - around - _LENGTH_MM * size
+    return b * _BIN_MM - around - 185.0 * size  # the length of a home-sized hand, mm
 
 
 @kernel()
@@ -339,7 +317,7 @@ def compare_ends(blocks, labels, surfaces, ends, size, intrinsics, unlike):
         )
         nearest = min(nearest, depth[k])
     for k in range(len(unlike)):
-        unlike[k] += _PER_MM_BEHIND * min(depth[k] - nearest, _MOST_BEHIND_MM)
+        unlike[k] += 0.012 * min(depth[k] - nearest, 800.0)
 
 
 @inner_kernel()
@@ -457,7 +435,7 @@ def _reach(blocks, labels, row, column):
         for b in range(max(column - 1, 0), min(column + 2, labels.shape[1])):
             if labels[a, b] == MAX_SURFACES:
                 farthest = max(farthest, blocks[a, b])
-    return farthest + np.float32(_RIM_MM) if farthest > 0 else farthest
+    return farthest + np.float32(45.0) if farthest > 0 else farthest  # mm, its thickness there
 
 
 @inner_kernel()
@@ -479,17 +457,18 @@ def extract_one(depth, n_candidates, sight, crops, k):
     blocks = np.empty((depth.shape[0] // BLOCK, depth.shape[1] // BLOCK), np.float32)
     labels = np.empty(blocks.shape, np.int32)
     areas = np.empty(MAX_SURFACES)
-    ends = np.empty((_MOST_ENDS, N_END))
+    ends = np.empty((8, N_END))
     focal2 = intrinsics[0] * intrinsics[1]
     block_depths(depth, sight.near, sight.far, blocks)
-    n_surfaces = label_surfaces(blocks, labels, focal2, _LEAST_MM2 * size * size, areas)
+    # no hand is smaller
+    n_surfaces = label_surfaces(blocks, labels, focal2, 2500.0 * size * size, areas)
     surfaces = list_surfaces(blocks, labels, n_surfaces, intrinsics)
     n_ends = nearest_ends(blocks, labels, surfaces, size, intrinsics, ends)
     unlike = np.empty(n_ends)
     compare_ends(blocks, labels, surfaces, ends, size, intrinsics, unlike)
     ranked = np.argsort(unlike)
     n_alike = min(n_ends, 2)
-    if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + _AS_LIKE:
+    if n_ends > 1 and unlike[ranked[1]] > unlike[ranked[0]] + 1.0:  # the second is no hand
         n_alike = 1
     for rank in range(n_candidates):
         row = k + rank * (len(crops.n_px) // n_candidates)

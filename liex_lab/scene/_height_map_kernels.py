@@ -16,10 +16,6 @@ from liex_lab.scene import _blob_kernels as blob_kernels
 
 AREA_FACTOR = 4.0  # a blob this many times larger or smaller than the animal is not the animal
 BRIDGE = 4  # blocks without readings that may lie between the parts of an animal of the camera view
-_MORE = 1.3  # a component with more than this many areas of the animal may contain another object
-_APART = 2.0  # in roots of the animal's area: a larger gap in depth separates objects
-_LAYERS = 3  # passes: a bar in front of the animal, a speck behind it
-_FAR = 65_535  # mm: behind everything
 _ON_FLOOR_SHARE = 0.3  # least share on the floor of an animal that leans over its edge
 
 
@@ -141,9 +137,9 @@ def parted(depth, limit, labels, blobs, area, mm2_per_px):
     """
     for slot in range(len(blobs)):
         blob = blob_kernels.unpack_blob(blobs[slot])
-        if blob_area(blob, mm2_per_px) > _MORE * area:
+        if blob_area(blob, mm2_per_px) > 1.3 * area:  # may contain another object
             cut, near, far = blob_kernels.layers(
-                depth, limit, labels, slot, blob, _APART * np.sqrt(area)
+                depth, limit, labels, slot, blob, 2.0 * np.sqrt(area)
             )
             if cut > 0.0:
                 behind = abs(np.log(far * mm2_per_px / area)) < abs(
@@ -170,7 +166,7 @@ def _push_back(depth, labels, slot, cut):
                 for v in range(i * blob_kernels.BLOCK, (i + 1) * blob_kernels.BLOCK):
                     for u in range(j * blob_kernels.BLOCK, (j + 1) * blob_kernels.BLOCK):
                         if depth[v, u] > cut:
-                            depth[v, u] = _FAR
+                            depth[v, u] = 65_535  # mm, behind everything
 
 
 @inner_kernel()
@@ -198,7 +194,8 @@ def extract_one(depth, limit, on_floor, area, n_candidates, parts, sight, crops,
     mm2_per_px = 1.0 / (sight.intrinsics[0] * sight.intrinsics[1])
     bridge = BRIDGE if sight.behind_mm > 0.0 else 0
     n_found = blob_kernels.label_blobs(depth, limit, on_floor, bridge, labels, blobs)
-    for _ in range(_LAYERS if parts and area > 0.0 else 0):
+    # a bar in front of the animal, a speck behind it
+    for _ in range(3 if parts and area > 0.0 else 0):
         depth, changed = parted(depth, limit, labels, blobs[:n_found], area, mm2_per_px)
         if not changed:
             break

@@ -34,19 +34,8 @@ from liex_lab.scene.support_plane import (
     still_object,
 )
 
-# readings within this distance, relative or in mm, belong to one surface
-_MODE_SHARE = 0.012
-_MODE_MM = 6.0
-_NEAR_SHARE = 0.05  # of a pixel's readings may be nearer than its nearest usual depth
-# an animal this long is resolved well enough
-_LENGTH_PX = 64.0
-_MAX_STRIDE = 4
 _ROWS = 32  # of pixels whose readings are sorted at once
-# noise changes readings in at least this share of the image's _CELLS x _CELLS cells (median over
-# _PAIRS pairs of frames); a moving animal changes only its own cells
-_EVERYWHERE = 0.8
-_CELLS = 8
-_PAIRS = 32
+_CELLS = 8  # of the image per side, inspected for noise
 
 
 def sampled(n: int, most: int) -> NDArray[np.int64]:
@@ -90,14 +79,15 @@ def has_noise(sample: NDArray[np.float32]) -> bool:
     """
     shares = []
     cells = [np.unique(np.arange(_CELLS) * n // _CELLS) for n in sample.shape[1:]]
-    for before, after in pairwise(sample[:: max(1, len(sample) // _PAIRS)]):
+    for before, after in pairwise(sample[:: max(1, len(sample) // 32)]):  # about 32 pairs of frames
         changed, read = (
             np.maximum.reduceat(np.maximum.reduceat(where, cells[0]), cells[1], axis=1)
             for where in (before != after, (before > 0) | (after > 0))
         )
         if changed.any():
             shares.append(float(changed.sum() / read.sum()))
-    return len(shares) > 0 and float(np.median(shares)) > _EVERYWHERE
+    # noise changes readings in at least this share of the cells, a moving animal only its own
+    return len(shares) > 0 and float(np.median(shares)) > 0.8
 
 
 def usual_depth(depth_images: NDArray[Any]) -> NDArray[Any]:
@@ -126,7 +116,7 @@ def stride_for(recording: Recording, length_mm: float) -> int:
         depth = recording.frame(index).depth
         if (depth > 0).any():
             px = length_mm * recording.camera.fx / float(np.median(depth[depth > 0]))
-            return min(_MAX_STRIDE, max(1, int(px / _LENGTH_PX)))
+            return min(4, max(1, int(px / 64.0)))
     return 1
 
 
@@ -146,7 +136,9 @@ def learn_background(
     stack = sample if isinstance(sample, np.ndarray) else sample_frames(sample, 96)
     check_shapes("a sample", ("frames", stack, ("n", "H", "W")))
     found = np.zeros((3, *stack.shape[1:]), np.float32)
-    numbers = [np.float32(value) for value in (_MODE_SHARE, _MODE_MM, _NEAR_SHARE)]
+    # readings within 1.2 % or 6 mm belong to one surface; a twentieth of a pixel's readings may
+    # be nearer than its nearest usual depth
+    numbers = [np.float32(value) for value in (0.012, 6.0, 0.05)]
     for start in range(0, stack.shape[1], _ROWS):
         rows = slice(start, start + _ROWS)
         # numpy sorts many short rows five times as fast as a compiled loop does
@@ -162,14 +154,6 @@ def learn_background(
 
 Array = NDArray[np.float64]
 Depths = NDArray[np.float32]
-
-_N_PIXELS = 4096
-_REACH_MM = 15.0  # readings farther from the median are no floor
-_LEAST_READ = 0.25  # least share of the floor's pixels read in a frame for a level
-_LEAST_MM = 2.0  # range of the levels from 5 to 95 %: less is noise
-_MOST_MM = 30.0  # more is another scene or a displaced camera
-_ROUGH = 0.25  # largest mean step between sampled frames, as a share of that range
-_FIRST = 0.05  # share of the sample that counts as the beginning
 
 
 @dataclass(frozen=True)
@@ -197,7 +181,7 @@ class FloorLevel:
             on_floor: (H, W) bool, bare floor.
         """
         rows, columns = np.nonzero(on_floor & (background > 0))
-        some = np.linspace(0, max(len(rows) - 1, 0), min(len(rows), _N_PIXELS)).astype(int)
+        some = np.linspace(0, max(len(rows) - 1, 0), min(len(rows), 4096)).astype(int)
         return FloorLevel(rows[some], columns[some], background[rows[some], columns[some]])
 
     def of(self, depths: Depths) -> Array:
@@ -214,10 +198,10 @@ class FloorLevel:
         for k, depth in enumerate(depths):
             read = depth[self.rows, self.columns]
             valid = read > 0
-            if valid.sum() < max(1.0, _LEAST_READ * len(self.rows)):
+            if valid.sum() < max(1.0, 0.25 * len(self.rows)):  # too little of the floor is read
                 continue
             off = (read[valid] - self.depth_mm[valid]).astype(float)
-            off = off[np.abs(off - np.median(off)) < _REACH_MM]
+            off = off[np.abs(off - np.median(off)) < 15.0]  # farther from the median is no floor
             levels[k] = off.mean() if len(off) else 0.0  # no reading near the median: no level
         return levels
 
@@ -259,9 +243,10 @@ def wandering(levels: Array) -> tuple[float, float] | None:
     low, high = np.percentile(levels, [5, 95])
     wander = float(high - low)
     rough = float(np.abs(np.diff(levels)).mean())
-    if not _LEAST_MM <= wander <= _MOST_MM or rough > _ROUGH * wander:
+    # less is noise, more another scene or a displaced camera; a rough course is no drift
+    if not 2.0 <= wander <= 30.0 or rough > 0.25 * wander:
         return None
-    first = max(3, round(_FIRST * len(levels)))
+    first = max(3, round(0.05 * len(levels)))  # the beginning
     return float(np.median(levels[:first])), wander
 
 
@@ -270,8 +255,6 @@ def wandering(levels: Array) -> tuple[float, float] | None:
 
 Mask = NDArray[np.bool_]
 
-_READ = 0.5  # pixels read in fewer frames are holes
-_AROUND = 0.7  # share of a hole's surroundings that is floor
 _FLAT_MM = 15.0  # distance from the plane
 
 
@@ -296,26 +279,20 @@ def unread_floor(
     Returns:
         (H, W) bool: pixels whose background should be the floor but is not.
     """
-    dark = on_floor & ((sample > 0).mean(axis=0) < _READ)
+    dark = on_floor & ((sample > 0).mean(axis=0) < 0.5)  # holes: read in fewer frames
     raised = dark & (background > 0) & (bare - background > min_height_mm)
     flat = (background > 0) & (np.abs(background - bare) < _FLAT_MM)
     found = np.zeros(dark.shape, np.bool_)
     for hole in parts(dark, least_px) if raised.any() else ():
         ring = cv2.dilate(hole.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
         around = ring & ~dark & (background > 0)
-        if (hole & raised).any() and around.any() and flat[around].mean() > _AROUND:
+        # the share of a hole's surroundings that is floor
+        if (hole & raised).any() and around.any() and flat[around].mean() > 0.7:
             found |= hole & raised
     return found
 
 
 # A lasting change of the scene: the camera was displaced, or its scene rearranged.
-
-_N_PARTS = 4
-_LEAST_FRAMES = 8  # of a part
-_N_CHANGE_PIXELS = 10_000
-_ELSEWHERE_MM = 12.0  # exceeds the drift and noise that remain in a median
-_LEAST_SHARE = 0.06  # of the readings
-_LEAST_ANIMALS = 4.0  # in areas of the animal, whose own movement changes up to two
 
 
 @dataclass(frozen=True)
@@ -346,20 +323,22 @@ class SceneChange:
             The change; None if the scene does not change, or too few frames are given.
         """
         check_shapes("frames", ("sample", sample, ("n", "H", "W")), ("times_s", times_s, ("n",)))
-        n_parts = min(_N_PARTS, len(sample) // _LEAST_FRAMES)
+        n_parts = min(4, len(sample) // 8)  # of at least 8 frames each
         if n_parts < 2:
             return None
-        step = max(1, int(np.sqrt(sample[0].size / _N_CHANGE_PIXELS)))
+        step = max(1, int(np.sqrt(sample[0].size / 10_000)))  # of about 10,000 pixels
         depths = sample[:, ::step, ::step].reshape(len(sample), -1)
         usual = [_usual(part) for part in np.array_split(depths, n_parts)]
         found = None
         for a, b in [*zip(range(n_parts), range(1, n_parts), strict=False), (0, n_parts - 1)]:
             read = (usual[a] > 0) & (usual[b] > 0)
-            changed_px = read & (np.abs(usual[b] - usual[a]) > _ELSEWHERE_MM)
+            # more than the drift and noise that remain in a median
+            changed_px = read & (np.abs(usual[b] - usual[a]) > 12.0)
             share = float(changed_px.sum() / max(read.sum(), 1))
             pixels_mm2 = (step * usual[a][changed_px].astype(float)) ** 2 / (camera.fx * camera.fy)
-            is_more = share > (found[0] if found else _LEAST_SHARE)
-            if is_more and pixels_mm2.sum() > _LEAST_ANIMALS * area_mm2:
+            is_more = share > (found[0] if found else 0.06)  # of the readings
+            # the animal's own movement changes up to two of its areas
+            if is_more and pixels_mm2.sum() > 4.0 * area_mm2:
                 found = share, usual[a][changed_px], usual[b][changed_px], changed_px
         if found is None:
             return None

@@ -44,10 +44,6 @@ Mask = NDArray[np.bool_]
 
 AnyNumber = TypeVar("AnyNumber", bound=np.generic)
 
-# of the logarithms, from posture to posture of one animal
-_SIZE_SD = (0.25, 0.2)
-_ALIKE = np.log(1.5)  # areas that differ by less belong to one object
-
 
 @dataclass(frozen=True)
 class BackgroundSubtraction(Segmenter):
@@ -150,7 +146,8 @@ class BackgroundSubtraction(Segmenter):
         its own.
         """
         stands = self.view.frame == VIEWS[0]
-        return size_misfit(crops, self.area_mm2, self.volume_mm3 if stands else None, _SIZE_SD)
+        # of the logarithms, from posture to posture of one animal
+        return size_misfit(crops, self.area_mm2, self.volume_mm3 if stands else None, (0.25, 0.2))
 
     def view_rotation(self, camera_view: bool) -> Array:
         """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame.
@@ -295,7 +292,7 @@ class BackgroundSubtraction(Segmenter):
         low = self.view.area[0] * spine_mm[0] ** 2
         high = self.view.area[1] * spine_mm[1] ** 2
         for other in without_mm2:
-            areas[np.abs(np.log(np.maximum(areas, 1e-9) / other)) < _ALIKE] = 0.0
+            areas[np.abs(np.log(np.maximum(areas, 1e-9) / other)) < np.log(1.5)] = 0.0
         candidates = np.sort(areas[(areas > low) & (areas < high)])
         if not len(candidates):
             return 0.0, 0.0

@@ -29,16 +29,10 @@ Mask = NDArray[np.bool_]
 
 # pixels that vote for a plane, and planes tried
 _N_VOTERS = 6000
-_N_TRIALS = 600
-_N_FITTED = 60_000  # pixels that the plane is fitted to
 _INLIER_MM = 8.0  # a floor is flat to about this much, depth noise included
-_MIN_SHARE = 0.2  # least share of the readable pixels on the floor
 _MAX_TILT_DEG = 60.0
 # background this near to the plane is floor: flatness, noise and lens errors together
 _FLAT_MM = 15.0
-# range of camera positions in the training data
-_PLAUSIBLE_MM = (150.0, 3000.0)
-_MUCH_TILT_RAD = math.radians(15.0)
 
 
 @dataclass(frozen=True)
@@ -117,13 +111,13 @@ class Floor:
         """
         found = []
         distance = self.lens_distance_mm(lift_mm)
-        low, high = _PLAUSIBLE_MM
+        low, high = 150.0, 3000.0  # of the cameras in the training data
         if not low <= distance <= high:
             found.append(
                 f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to "
                 f"{high:.0f} mm; check the unit and the camera's height"
             )
-        if self.tilt_rad > _MUCH_TILT_RAD:
+        if self.tilt_rad > math.radians(15.0):
             found.append(
                 f"the camera looks down at {math.degrees(self.tilt_rad):.0f} degrees from "
                 "straight, and poses are learned up to 10; turn it to look straight down"
@@ -176,7 +170,8 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
             "depth unit and range"
         )
     rng = np.random.default_rng(seed)
-    chosen = rng.choice(len(rows), min(_N_FITTED, len(rows)), replace=False)
+    # the plane is fitted to these pixels
+    chosen = rng.choice(len(rows), min(60_000, len(rows)), replace=False)
     rows, columns = rows[chosen], columns[chosen]
     depth = background[rows, columns].astype(float)
     points, middle = _centred(rows, columns, background.shape)
@@ -184,7 +179,8 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     plane, share = _refit(points, depth, plane, 3)  # on many pixels, not only on the voters
     floor = _in_pixels(plane, middle, camera)
     tilt = np.degrees(np.arccos(np.clip(floor.normal[2], -1, 1)))
-    if share < _MIN_SHARE or tilt > _MAX_TILT_DEG:
+    # the least share of the readable pixels, and the most tilt
+    if share < 0.2 or tilt > _MAX_TILT_DEG:
         raise EstimationError(
             f"no floor was found: the largest plane contains {share:.0%} of the readable pixels "
             f"and is tilted by {tilt:.0f} degrees; the camera should look down on a floor"
@@ -199,7 +195,7 @@ def _largest_plane(points: Array, depth: Array, focal: float, rng: np.random.Gen
     Planes that do not face the camera (walls) are discarded. All are tried on some points, the best
     few on more. focal: in the units of the points.
     """
-    three = rng.integers(0, len(depth), (_N_TRIALS, 3))
+    three = rng.integers(0, len(depth), (600, 3))  # planes tried
     p = points[three]
     w = 1.0 / depth[three]
     ends = np.stack([p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]], axis=1)
@@ -323,14 +319,8 @@ def near_plane(background: NDArray[np.float32], bare: NDArray[np.float32]) -> Ma
 # Flat grounds of an empty scene: patches of every large plane that faces the camera.
 
 
-_WINDOWS = 14  # along the image's longer side, each overlapping its neighbours by half
-_READ_SHARE = 0.5  # least share of a window's pixels that are readable
-_FLAT_SHARE = 0.7  # least share of those that lie on its plane
-_SIDE = 160  # analysed pixels per side
 _MAX_PLANES = 8
 _ROUNDS = 4
-_BEYOND_PX = 6  # width of the inspected surroundings of a patch
-_RISE_MM = 20.0  # least height of a wall above its floor
 
 
 @dataclass(frozen=True)
@@ -368,7 +358,7 @@ def flat_grounds(
     Returns:
         The grounds; empty if nothing is flat.
     """
-    step = max(1, max(background.shape) // _SIDE)
+    step = max(1, max(background.shape) // 160)  # about 160 analysed pixels per side
     rows, columns = np.mgrid[0 : background.shape[0] : step, 0 : background.shape[1] : step]
     depth = background[::step, ::step].astype(float)
     points, middle = _centred(rows, columns, background.shape)
@@ -397,19 +387,21 @@ def flat_grounds(
 
 def _seeds(points: Array, depth: Array, focal: float) -> Array:
     """The planes (n, 3), 1 / depth = points . plane, of the image's flat windows."""
-    side = max(4, max(depth.shape) // _WINDOWS)
+    # windows along the longer side, each overlapping its neighbours by half
+    side = max(4, max(depth.shape) // 14)
     found = []
     for row in range(0, max(1, depth.shape[0] - side + 1), side // 2):
         for column in range(0, max(1, depth.shape[1] - side + 1), side // 2):
             window = (slice(row, row + side), slice(column, column + side))
             read = depth[window] > 0
-            if read.mean() < _READ_SHARE or read.sum() < 12:
+            if read.mean() < 0.5 or read.sum() < 12:  # too little is readable
                 continue
             some = points[window][read]
             at = depth[window][read]
             kept = np.abs(at - np.median(at)) < 4.0 * np.median(np.abs(at - np.median(at))) + 1.0
             plane = _fit(some[kept], at[kept])
-            if _on(some @ plane, at).mean() >= _FLAT_SHARE and plane[2] > 0:
+            # of the readable pixels, on its plane
+            if _on(some @ plane, at).mean() >= 0.7 and plane[2] > 0:
                 found.append(plane)
     return _facing(np.array(found).reshape(-1, 3), focal)
 
@@ -469,14 +461,15 @@ def _enclosed(background: NDArray[np.float32], patch: Mask, floor: Floor, camera
     import cv2
 
     hull = convex_hull(patch)
-    reach = 2 * max(_BEYOND_PX, background.shape[1] // 40) + 1
+    reach = 2 * max(6, background.shape[1] // 40) + 1  # width of the inspected surroundings
     v, u = np.mgrid[0 : background.shape[0], 0 : background.shape[1]]
     above = floor.heights(u, v, background)
     high = np.where((background > 0) & ~hull, above, -1e6).astype(np.float32)
     highest = cv2.dilate(high, np.ones((reach, reach), np.uint8))
     ring = (cv2.dilate(hull.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~hull
     n_cut = int(hull[0].sum() + hull[-1].sum() + hull[:, 0].sum() + hull[:, -1].sum())
-    return float((highest[ring] > _RISE_MM).sum()) / max(1, int(ring.sum()) + n_cut)
+    # a wall rises this far above its floor
+    return float((highest[ring] > 20.0).sum()) / max(1, int(ring.sum()) + n_cut)
 
 
 # Masks of pixels: convex hulls and connected components.

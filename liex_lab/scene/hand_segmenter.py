@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 
 RANGE_MM = (250.0, 1600.0)  # least and largest depth of a hand
 _FLAT = np.array([0.0, 0.0, 1.0])  # perpendicular to the optical axis
-_SIZE_SD = (0.45, 0.45)  # of the logarithms of area and volume, between postures of one hand
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,8 @@ class HandSegmenter(Segmenter):
 
     def misfit(self, crops: HeightMaps) -> Array:
         """See `Segmenter`."""
-        return size_misfit(crops, self.area_mm2, self.volume_mm3, _SIZE_SD)
+        # of the logarithms, between postures of one hand
+        return size_misfit(crops, self.area_mm2, self.volume_mm3, (0.45, 0.45))
 
     def crop_cameras(self, crops: HeightMaps, camera_view: bool = False) -> Array:
         """The crop cameras of height maps: intrinsics, T_view_camera, origin and step of each crop.

@@ -37,8 +37,6 @@ from liex_lab.scene.worn import find_worn
 Depths = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_OTHER = 3.0  # ratio of areas beyond which it is another object
-
 
 def learn_scene(
     recording: Recording,
@@ -174,7 +172,8 @@ def _moving_area(
     support_plane = scene.support_plane
     if support_plane is None or not support_plane.moves or scene.view.frame != VIEWS[0]:
         return area, share
-    if area > 0.0 and abs(np.log(area / support_plane.mover_mm2)) < np.log(_OTHER):
+    # beyond this ratio, it is another object
+    if area > 0.0 and abs(np.log(area / support_plane.mover_mm2)) < np.log(3.0):
         return area, share
     if share >= 0.5 and is_like_an_animal(replace(scene, area_mm2=area), sample, target):
         return area, share
@@ -185,15 +184,9 @@ def _moving_area(
 # The quality card of a sensor.
 
 _N_PIXELS = 20_000  # inspected for noise and edges, spread over the image
-_N_FRAMES = 12  # inspected for the seam around the animal
-_LEAST_READ = 0.5  # least share of frames that read a pixel used for noise
 _LEAST = 200  # fewer pixels, readings or seam pixels give no estimate
-_SAME_MM = 6.0  # readings within this distance belong to the background
-_SAME_SHARE = 0.012
-_JUMP_MM = 60.0  # of depth within two pixels: an edge
 _MIDDLE = (0.25, 0.75)  # of the jump: readings there belong to neither side
 _REACH_PX = 4  # largest distance of the seam from the outline
-_ROUND_MM = 0.05  # a finer step is continuous
 
 
 def read_sensor(scene: BackgroundSubtraction, sample: Depths) -> SensorCard:
@@ -219,9 +212,10 @@ def _noise(background: Depths, sample: Depths) -> tuple[tuple[float, float], ...
     valid = valid[:: max(1, len(valid) // _N_PIXELS)]
     depth = background.ravel()[valid]
     off = sample.reshape(len(sample), -1)[:, valid] - depth
-    still = np.abs(off) < np.maximum(_SAME_MM, _SAME_SHARE * depth)
+    # readings nearer than this are the background
+    still = np.abs(off) < np.maximum(6.0, 0.012 * depth)
     n = still.sum(axis=0)
-    steady = n >= max(3, _LEAST_READ * len(sample))
+    steady = n >= max(3, 0.5 * len(sample))  # of the frames
     if steady.sum() < _LEAST:
         return ()
     off, still, n, depth = off[:, steady], still[:, steady], n[steady], depth[steady]
@@ -247,14 +241,15 @@ def _step(sample: Depths) -> float | None:
     if len(values) < 3:
         return None
     gap = float(np.median(np.diff(values)))
-    return round(gap, 3) if gap > _ROUND_MM else None
+    return round(gap, 3) if gap > 0.05 else None  # a finer step is continuous
 
 
 def _seam(scene: BackgroundSubtraction, sample: Depths) -> float | None:
     """Width of the unread seam around the animal, px of the image, beyond the usual share of unread
     pixels.
     """
-    rows = np.linspace(0, len(sample) - 1, min(_N_FRAMES, len(sample))).astype(int)
+    # some frames show the seam well enough
+    rows = np.linspace(0, len(sample) - 1, min(12, len(sample))).astype(int)
     shown = sample[rows]
     crops = scene.extract(shown, 1.0)
     unread = np.zeros(_REACH_PX)
@@ -279,7 +274,8 @@ def _seam(scene: BackgroundSubtraction, sample: Depths) -> float | None:
 def _mixed(background: Depths, sample: Depths) -> float | None:
     """Share of the readings at edges of the still scene that lie between both sides."""
     left, right = background[:, :-2], background[:, 2:]
-    edge = (left > 0) & (right > 0) & (np.abs(left - right) > _JUMP_MM)
+    # a jump of depth within two pixels is an edge
+    edge = (left > 0) & (right > 0) & (np.abs(left - right) > 60.0)
     rows, columns = np.nonzero(edge)
     chosen = slice(None, None, max(1, len(rows) // _N_PIXELS))
     rows, columns = rows[chosen], columns[chosen]

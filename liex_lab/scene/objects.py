@@ -33,17 +33,11 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 _LEAST_FRAMES = 6  # least frames of the sample with it, and without it
-_LEAST_SHARE = 0.1  # of the recording: a shorter presence is a visit
 _HIGH_SHARE = 0.9  # least share of high readings inside the interval, and 1 - this at most outside
-_SAME_MM = 6.0  # readings within this distance of the median belong to the object
-_SAME_SHARE = 0.012
-_STILL = 0.6  # least share of such readings: hands and animals move
 _ALIKE = 3  # frames by which the intervals of one object's pixels may differ
 _LEAST_PX = 8
 _MOST = 8  # objects
-_OWN = 0.3  # share of an object's pixels covered by the animal if it is the animal
 _OFTEN = 0.5  # of the frames
-_ASKED = 16  # frames used for that test
 
 
 def find_transient_objects(scene: Scene, sample: Depths, times_s: Array) -> tuple[Fixture, ...]:
@@ -95,9 +89,10 @@ def _if_still(sample: Depths, mask: Mask, first: int, last: int) -> list[_Transi
     """
     readings = sample[first:last, mask]
     usual = np.nanmedian(np.where(readings > 0, readings, np.nan), axis=0)
-    same = np.abs(readings - usual) < np.maximum(_SAME_MM, _SAME_SHARE * usual)
+    same = np.abs(readings - usual) < np.maximum(6.0, 0.012 * usual)
     shows = np.flatnonzero(same.mean(axis=1) > 0.5)
-    if same.mean() < _STILL or len(shows) < max(_LEAST_FRAMES, _LEAST_SHARE * len(sample)):
+    # hands and animals move, and a shorter presence than a tenth of the recording is a visit
+    if same.mean() < 0.6 or len(shows) < max(_LEAST_FRAMES, 0.1 * len(sample)):
         return []
     depth = np.zeros(mask.shape, np.float32)
     depth[mask] = usual
@@ -112,15 +107,16 @@ def _is_an_animal(scene: Scene, sample: Depths, first: int, last: int, mask: Mas
     rows = np.arange(len(sample))
     inside = (rows >= first) & (rows < last)
     own = scene.animal_masks(scene.extract(sample[_some(rows[inside])], 1.0))
-    if own and float(np.mean([one[mask].mean() > _OWN for one in own])) > _OFTEN:
+    # the animal covers this share of it
+    if own and float(np.mean([one[mask].mean() > 0.3 for one in own])) > _OFTEN:
         return True
     others = scene.extract(sample[_some(rows[~inside])], 1.0)
     return float((others.n_blobs > 1).mean()) > _OFTEN
 
 
 def _some(rows: Rows) -> Rows:
-    """At most `_ASKED` of the rows, spread evenly."""
-    return rows[np.unique(np.linspace(0, len(rows) - 1, _ASKED).astype(int))]
+    """At most 16 of the rows, spread evenly."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, 16).astype(int))]
 
 
 def _stretches(scene: Scene, sample: Depths) -> tuple[Rows, Rows, Rows, Rows]:
@@ -152,19 +148,6 @@ def _stretches(scene: Scene, sample: Depths) -> tuple[Rows, Rows, Rows, Rows]:
 # Animals at rest, wholly or in part, that were absorbed into the scene's background.
 
 
-# a lump touched by the animal in this share of the frames is a resting part of it
-_TOUCH_SHARE = 0.9
-_READ = 0.5  # of a lump: it is present if this share is read
-# an object that never moves is an animal only if it is shorter than _LONGEST largest spines, higher
-# than _HIGHER detection heights, and larger than _LARGER smallest areas
-_LONGEST = 2.0
-_HIGHER = 1.4
-_LARGER = 1.5
-_KINDS = 4  # candidate areas compared with an animal
-_IN_PLACE = 0.8  # least share of frames that show it near its median position
-_LEAST_LUMP_PX = 16  # of a lump
-_MOST_LUMPS = 16  # compared with an animal
-_FREE = 0.75  # least share of a lump's edge that is bare floor; half for the foot of a wall
 _AROUND_PX = 4  # width of a lump's edge, which flickers between it and the floor
 
 
@@ -192,7 +175,7 @@ def find_resting_animal(
     if share >= 0.5 and (not target.stands_on_floor or is_like_an_animal(moving, sample, target)):
         return None
     rests = _changing_lump(scene, sample, target) if target.stands_on_floor else None
-    rests = rests or _on_bare_floor(scene, sample, target, 1 if share > 0.0 else _KINDS)
+    rests = rests or _on_bare_floor(scene, sample, target, 1 if share > 0.0 else 4)
     resting, resting_share, is_like = rests
     if resting_share <= (share if share < 0.5 else 0.0):
         return None
@@ -229,9 +212,11 @@ def with_its_still_part(scene: Scene, sample: Depths, target: TargetAnimal, area
     for lump in _lumps(scene, target):
         near = _around(lump)
         box = _box(near)
-        there = (shown[:, *box][:, lump[box]] > 0).mean(axis=1) > _READ
+        # present if half of it is read
+        there = (shown[:, *box][:, lump[box]] > 0).mean(axis=1) > 0.5
         touched = moving[there][:, *box][:, near[box]].any(axis=1)
-        if not there.any() or touched.mean() < _TOUCH_SHARE:
+        # a lump touched less often is no resting part of it
+        if not there.any() or touched.mean() < 0.9:
             continue
         whole = _with_floor_at(scene, near, target)
         whole_area, share = whole.usual_area(sample, target.spine_mm)
@@ -261,14 +246,16 @@ def _inspected(scene: Scene, sample: Depths, target: TargetAnimal) -> tuple[bool
     blobs = shown.blobs
     length = 4.0 * float(np.median(blobs.sd_along))
     height = float(np.median(blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)))
+    # in units of the largest spine, the detection height and the smallest area
     is_like = (
-        length < _LONGEST * target.spine_mm[1]
-        and height > _HIGHER * target.min_height_mm
-        and scene.area_mm2 > _LARGER * target.smallest_mm2
+        length < 2.0 * target.spine_mm[1]
+        and height > 1.4 * target.min_height_mm
+        and scene.area_mm2 > 1.5 * target.smallest_mm2
     )
     centroid = np.column_stack([blobs.x, blobs.y])
     off = np.linalg.norm(centroid - np.median(centroid, axis=0), axis=1)
-    stays = (off < 0.5 * np.sqrt(scene.area_mm2)).mean() > _IN_PLACE
+    # near its median position in most frames that show it
+    stays = (off < 0.5 * np.sqrt(scene.area_mm2)).mean() > 0.8
     return is_like, bool(stays)
 
 
@@ -281,9 +268,10 @@ def _changing_lump(scene: Scene, sample: Depths, target: TargetAnimal) -> Restin
     free = []
     for lump in _lumps(scene, target):
         near = _around(lump)
-        if _free(scene, near & ~lump, target) >= _FREE:
+        # of its edge is bare floor; half for the foot of a wall
+        if _free(scene, near & ~lump, target) >= 0.75:
             free.append((_change(scene, sample, near, target), lump, near))
-    for _, lump, near in sorted(free, key=lambda one: -one[0])[:_MOST_LUMPS]:
+    for _, lump, near in sorted(free, key=lambda one: -one[0])[:16]:
         whole = _with_floor_at(scene, near, target)
         areas = _areas_at(whole, sample, lump, target)
         own = (areas > target.smallest_mm2) & (areas < target.largest_mm2)
@@ -323,7 +311,7 @@ def _lumps(scene: Scene, target: TargetAnimal) -> Iterator[Mask]:
     """The lumps (H, W) bool of the background on the floor."""
     above = scene.bare - scene.background
     raised = scene.on_floor & (scene.background > 0) & (above > target.min_height_mm)
-    return parts(raised, _LEAST_LUMP_PX)
+    return parts(raised, 16)
 
 
 def _free(scene: Scene, edge: Mask, target: TargetAnimal) -> float:

@@ -33,16 +33,8 @@ RECTANGULAR = "rectangular"
 IRREGULAR = "irregular"
 OPEN = "open"
 _BORDER_PX = 8  # outline this near to the image border is not the floor's own
-_NOTCH_PX = 3.0  # outline this far inside the convex hull belongs to an object on the floor
-_VIEW_SHARE = 0.6  # least visible share of the outline
-# largest residual of a fitted shape, relative to its size or in mm
-_FIT_SHARE = 0.025
-_FIT_MM = 4.0
-_BAND_MM = 60.0  # width beyond the outline in which walls are searched for
+_FIT_MM = 4.0  # largest residual of a fitted shape, or 2.5 % of its size
 _WALL_MM = 20.0  # least height of a wall, or depth of a drop
-_SIDE_SHARE = 0.3  # least visible share of each side of a rectangle
-_N_CIRCLES = 150  # tried
-_MAX_POINTS = 720  # of the outline
 
 
 @dataclass(frozen=True)
@@ -147,13 +139,13 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
             fits.
     """
     points, pixels, share = _outline(background, floor, camera)
-    if share < _VIEW_SHARE or len(points) < 40:
+    if share < 0.6 or len(points) < 40:  # too little of it is in view
         return Arena(OPEN, seen_share=share)
     edge = _edge(background, floor, camera, pixels)
     centre, radius, off_circle = fit_circle(points)
     middle, half, yaw, off_rectangle = fit_rectangle(points)
     size = float(np.sqrt(np.prod(half)))
-    if min(off_circle, off_rectangle) > max(_FIT_MM, _FIT_SHARE * size):
+    if min(off_circle, off_rectangle) > max(_FIT_MM, 0.025 * size):
         return Arena(IRREGULAR, seen_share=share, edge=edge)
     if off_circle <= off_rectangle:
         return Arena(ROUND, _pair(centre), radius, None, None, off_circle, share, edge)
@@ -184,8 +176,9 @@ def _outline(
     inward = cv2.distanceTransform(np.pad(filled, 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
     uv = contour[:, 0]
     clear = ((uv >= _BORDER_PX) & (uv < np.array([width, height]) - _BORDER_PX)).all(axis=1)
-    uv = uv[clear & (inward[uv[:, 1], uv[:, 0]] < _NOTCH_PX)]
-    uv = uv[np.linspace(0, len(uv) - 1, min(len(uv), _MAX_POINTS)).astype(int)]
+    # farther inside the hull, it belongs to an object on the floor
+    uv = uv[clear & (inward[uv[:, 1], uv[:, 0]] < 3.0)]
+    uv = uv[np.linspace(0, len(uv) - 1, min(len(uv), 720)).astype(int)]
     share = _share_in_view(hull[:, 0].astype(float), width, height)
     depth = background[uv[:, 1], uv[:, 0]].astype(float)
     out = _outward(uv, hull[:, 0].mean(axis=0))
@@ -224,9 +217,7 @@ def fit_circle(points: Array) -> tuple[Array, float, float]:
     Returns:
         Centre (2,), radius and median distance, in the unit of the points.
     """
-    a, b, c = np.moveaxis(
-        points[np.random.default_rng(0).integers(0, len(points), (_N_CIRCLES, 3))], 1, 0
-    )
+    a, b, c = np.moveaxis(points[np.random.default_rng(0).integers(0, len(points), (150, 3))], 1, 0)
     p = b - a
     q = c - a
     twice = 2.0 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
@@ -308,7 +299,7 @@ def _all_sides_in_view(points: Array, centre: Array, half: Array, yaw: float) ->
             along = local[np.abs(local[:, axis] - end * half[axis]) < _FIT_MM, 1 - axis]
             if (
                 len(along) < 8
-                or np.diff(np.percentile(along, [10, 90]))[0] < _SIDE_SHARE * 2.0 * half[1 - axis]
+                or np.diff(np.percentile(along, [10, 90]))[0] < 0.3 * 2.0 * half[1 - axis]
             ):
                 return False
     return True
@@ -317,7 +308,8 @@ def _all_sides_in_view(points: Array, centre: Array, half: Array, yaw: float) ->
 def _edge(background: NDArray[np.float32], floor: Floor, camera: Camera, pixels: Array) -> str:
     """What is just outside the outline, pixels (n, 2): wall, drop or unknown."""
     out = _outward(pixels, pixels.mean(axis=0))
-    reach = max(4.0, _BAND_MM * np.sqrt(camera.fx * camera.fy) / floor.distance_mm)
+    # walls are searched for within 60 mm
+    reach = max(4.0, 60.0 * np.sqrt(camera.fx * camera.fy) / floor.distance_mm)
     beyond = pixels + out * np.arange(2.0, reach)[:, None, None]  # (k, n, 2)
     column, row = np.moveaxis(np.rint(beyond).astype(int), -1, 0)
     inside = (
@@ -359,8 +351,6 @@ STATED = "plan"
 
 HIGH_MM = 20.0  # least height of a fixture above the floor
 LEAST_MM2 = 300.0  # smaller ones are specks
-_MOST = 32  # fixtures reported
-_MOST_ROUND = 1.6  # largest ratio of hull to area: beyond, it is the walls
 
 
 @dataclass(frozen=True)
@@ -557,12 +547,12 @@ def find_fixtures(
     found = []
     for mask in parts(high):
         hull = cv2.convexHull(cv2.findNonZero(mask.astype(np.uint8)))
-        if cv2.contourArea(hull) > _MOST_ROUND * mask.sum():
+        if cv2.contourArea(hull) > 1.6 * mask.sum():
             continue  # the walls surround the floor and do not stand on it
         fixture = fixture_at(mask, background, floor, camera)
         if fixture.area_mm2 >= LEAST_MM2:
             found.append(fixture)
-    return tuple(sorted(found, key=lambda fixture: -fixture.area_mm2)[:_MOST])
+    return tuple(sorted(found, key=lambda fixture: -fixture.area_mm2)[:32])
 
 
 def fixture_at(mask: Mask, depth: NDArray[np.float32], floor: Floor, camera: Camera) -> Fixture:

@@ -34,25 +34,9 @@ from liex_lab.scene.scene import BY_SUPPORT, LARGEST, STATED, WALLED
 Array = NDArray[np.float64]
 
 _AROUND_PX = 5  # radius of the ground inspected around an object
-_ON_MM = 9.0  # largest median distance between a plane and the ground under an object on it
-_ON_SHARE = 0.25  # least share of the ground around the object that is part of the patch
 _MIN_MOVERS = 5  # fewer moving objects are no evidence
 _SUPPORTED = 0.5  # share of the movers that a floor has to support
-_UNSUPPORTED = 0.1  # a stated floor that supports less is wrong
-_BETTER = 0.2  # additional support required to prefer another ground
 _ENCLOSED = 0.6  # share of a ground's outline that must be walled if nothing moves
-_RAISED_MM = 30.0  # least height of such a ground above the largest plane
-_CLEARLY = 1.5  # multiple of the detection height that is not noise
-_LEAST_PX = 9
-_A_FRAME = 3  # largest objects per frame
-# a plane fitted across a step matches neither side: beyond this offset of the ground under the
-# movers, the plane is fitted to that ground alone
-_STEP_MM = 2.5
-_LEVEL_MM = 3.0  # ground within this distance is fitted
-_EVEN_MM = 1.5  # largest median offset of the movers after the fit
-_ROUNDS = 4
-_ROOM = 3.0  # least area of a ground, in areas of an animal
-_SMALLER = 1.0 / 3.0  # of the median largest volume: smaller objects are something else
 
 
 @dataclass(frozen=True)
@@ -110,7 +94,8 @@ class MovingObject:
 
     def stands_on(self, floor: Floor) -> bool:
         """Whether the ground around it lies on a plane."""
-        return bool(abs(self.above(floor)) < _ON_MM)
+        # the ground under an object on a plane is this near to it
+        return bool(abs(self.above(floor)) < 9.0)
 
     def above(self, floor: Floor) -> float:
         """Median height of the ground around it above a plane, mm."""
@@ -119,7 +104,8 @@ class MovingObject:
     def is_on(self, floor: Floor, patch: NDArray[np.bool_]) -> bool:
         """Whether it stands on a patch (H, W) bool of a floor."""
         share = float(patch[self.rows, self.columns].mean())
-        return self.stands_on(floor) and share > _ON_SHARE
+        # of the ground around it is part of the patch
+        return self.stands_on(floor) and share > 0.25
 
 
 @dataclass(frozen=True)
@@ -240,8 +226,9 @@ def find_movers(scene: SampledScene) -> list[MovingObject]:
 
     found = side_by_side(inspect, range(len(scene.sample)))
     largest = [movers[0].volume_mm3 for movers in found if movers]
-    least = _SMALLER * float(np.median(largest)) if largest else 0.0
-    return [mover for movers in found for mover in movers[:_A_FRAME] if mover.volume_mm3 >= least]
+    # smaller ones are something else
+    least = (1.0 / 3.0) * float(np.median(largest)) if largest else 0.0
+    return [mover for movers in found for mover in movers[:3] if mover.volume_mm3 >= least]
 
 
 def _choose(scene: SampledScene, movers: list[MovingObject]) -> SupportPlane:
@@ -265,7 +252,8 @@ def _choose(scene: SampledScene, movers: list[MovingObject]) -> SupportPlane:
         largest_mm2 = float(np.percentile([mover.area_mm2 for mover in movers], 90))
         # it may move only its head
         usual_mm2 = float(np.sqrt(scene.target.smallest_mm2 * scene.target.largest_mm2))
-        least_mm2 = max(least_mm2, _ROOM * max(largest_mm2, usual_mm2))
+        # an animal's ground is at least three times its area
+        least_mm2 = max(least_mm2, 3.0 * max(largest_mm2, usual_mm2))
     grounds = flat_grounds(background, camera, least_mm2)
     if moves:
         chosen = _best_supported(grounds, movers, largest.support if largest else 0.0)
@@ -311,19 +299,19 @@ def levelled(
     if not scene.target.stands_on_floor or len(on) < _MIN_MOVERS:
         return support_plane
     step_mm = float(np.median([mover.above(floor) for mover in on]))
-    if abs(step_mm) < _STEP_MM:
+    if abs(step_mm) < 2.5:  # a plane fitted across a step matches neither side
         return support_plane
     camera = scene.camera
     own = Floor.from_plane(floor.normal, floor.distance_mm - step_mm, camera)
-    for _ in range(_ROUNDS):
+    for _ in range(4):
         bare = own.depth(camera.width, camera.height)
         ground = support_plane.on_floor & (scene.background > 0)
-        ground &= np.abs(scene.background - bare) < _LEVEL_MM
+        ground &= np.abs(scene.background - bare) < 3.0
         if (scene.background[ground] ** 2).sum() < scene.least_ground_mm2 * camera.fx * camera.fy:
             return support_plane
         own = fit_plane(scene.background, ground, camera)
     left = np.median([abs(mover.above(own)) for mover in on])
-    if left > _EVEN_MM:
+    if left > 1.5:  # still uneven
         return support_plane
     on_floor = floor_region(scene.background, own.depth(camera.width, camera.height))
     return replace(support_plane, floor=own, on_floor=on_floor)
@@ -340,7 +328,8 @@ def _as_stated(
     bare = floor.depth(camera.width, camera.height)
     on_floor = floor_region(background, bare)
     support = _share(movers, [mover.stands_on(floor) for mover in movers])
-    if not on_floor.any() or (len(movers) >= _MIN_MOVERS and support < _UNSUPPORTED):
+    # a stated floor that supports less is wrong
+    if not on_floor.any() or (len(movers) >= _MIN_MOVERS and support < 0.1):
         raise EstimationError(
             f"nothing stands on the floor stated by arena.floor, {floor.distance_mm:.0f} mm from "
             "the camera; correct its point and normal, or set arena.floor to 'auto'"
@@ -363,7 +352,7 @@ def _of_frame(
     )
     for k in range(1, len(stats)):
         u, v, width, height, n_px = stats[k]
-        if n_px < _LEAST_PX:
+        if n_px < 9:
             continue
         cut = (
             slice(max(0, v - _AROUND_PX), v + height + _AROUND_PX),
@@ -375,7 +364,7 @@ def _of_frame(
         if not scene.target.smallest_mm2 < float(mm2.sum()) < scene.target.largest_mm2:
             continue
         rise = (background[cut][own] - depth[cut][own]).astype(float)
-        if float(np.median(rise / (background[cut][own] - limit[cut][own]))) < _CLEARLY:
+        if float(np.median(rise / (background[cut][own] - limit[cut][own]))) < 1.5:
             continue  # noise of distant surfaces rises little, an animal much
         near = (cv2.dilate(whole.astype(np.uint8), around) > 0) & (background[cut] > 0)
         rows, columns = np.nonzero(near)
@@ -401,7 +390,7 @@ def _best_supported(
     """The ground that supports the most movers, its share of them, and no doubt; None if none is
     clearly better than `least`.
     """
-    best, most = None, min(least + _BETTER, _SUPPORTED)
+    best, most = None, min(least + 0.2, _SUPPORTED)  # another ground has to support clearly more
     for ground in grounds:
         share = _share(movers, [mover.is_on(ground.floor, ground.patch) for mover in movers])
         if share > most:
@@ -418,7 +407,7 @@ def _enclosed(
             continue
         rows, columns = np.nonzero(ground.patch)
         depth = 1.0 / np.maximum(ground.floor.inverse_at(columns, rows), 1e-9)
-        if largest is not None and (np.median(largest.heights(columns, rows, depth)) <= _RAISED_MM):
+        if largest is not None and (np.median(largest.heights(columns, rows, depth)) <= 30.0):
             return None  # walls enclose the largest plane itself
         doubt = (
             "no object of an animal's size moved, so the largest walled ground is used as the "

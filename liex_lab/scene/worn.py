@@ -137,14 +137,8 @@ class Worn(ABC):
 # Head stages: blocks cemented to the skull, which protrude from the animal on all sides.
 
 
-_NARROW_MM = 5.0  # least height of a narrow part above the wide one
-_STEP_MM = 6.0  # and above the surrounding body
 _AREA_MM2 = (30.0, 260.0)  # from above
-_BESIDE_PX = 2
-_ON_BODY = 0.3  # least share of animal around it, as the head ends in front
-_LEAST_SHARE = 0.6  # least share of the frames with an animal that show one
 _TIMES_AREA = 2.0  # a larger block is something else, such as a raised head
-_FOOT = 0.4  # of the step: higher pixels are the block, not the head
 
 
 @dataclass(frozen=True)
@@ -182,7 +176,8 @@ class HeadStage(Worn):
 
         found = side_by_side(inspect, list(sample))
         worn = [max(areas) for _, areas in found if areas]
-        if not worn or len(worn) < _LEAST_SHARE * sum(shows for shows, _ in found):
+        # of the frames with an animal show one
+        if not worn or len(worn) < 0.6 * sum(shows for shows, _ in found):
             return None
         return replace(largest, area_mm2=float(np.median(worn)) * largest._px_mm**2)
 
@@ -200,23 +195,25 @@ class HeadStage(Worn):
         )
         # single readings are noise, and a one-pixel hole does not split a body
         smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(height[cut]), 3))
-        narrow = (smooth - self._wide(smooth) > _NARROW_MM) & (smooth > 0)
+        # narrow parts rise this far above the wide one
+        narrow = (smooth - self._wide(smooth) > 5.0) & (smooth > 0)
         labels, stats = components(narrow.astype(np.uint8))
         least, most = (value / self._px_mm**2 for value in _AREA_MM2)
         most = min(most, _TIMES_AREA * self.area_mm2 / self._px_mm**2)
-        beside = np.ones((2 * _BESIDE_PX + 1,) * 2, np.uint8)
+        beside = np.ones((5, 5), np.uint8)
         for k in range(1, len(stats)):
             if stats[k, cv2.CC_STAT_AREA] < least:
                 continue
             part = labels == k
             ring = (cv2.dilate(part.astype(np.uint8), beside) > 0) & ~part
             body = smooth[ring & (smooth > 0)]
-            if len(body) < _ON_BODY * ring.sum():
+            if len(body) < 0.3 * ring.sum():  # more is not needed, as the head ends in front
                 continue
             around = float(np.median(body))
             step = float(np.percentile(smooth[part], 80)) - around
-            block = part & (smooth > around + _FOOT * step)
-            if step > _STEP_MM and least <= block.sum() <= most:
+            # higher pixels are the block, not the head
+            block = part & (smooth > around + 0.4 * step)
+            if step > 6.0 and least <= block.sum() <= most:  # and above the surrounding body
                 out = np.zeros(height.shape, np.bool_)
                 out[cut] = block
                 yield out, around
@@ -231,16 +228,8 @@ class HeadStage(Worn):
 # Cables and fibres: thin objects that rise from the animal beyond its own reach.
 
 
-_RISE_MM = 6.0  # least height of a cable above its surroundings
-_TALLER = 1.2  # in lengths of the largest animal: beyond its reach
-_BACK = 95.0  # %: quantile of the wide parts' heights that is the back
 _LINK_PX = 2  # largest unread gap in a cable
 _JOINED_PX = 3  # largest distance of a cable from the body it leads to
-_LEAST_RUN_MM = 40.0  # least extent in the image
-_CABLE_LEAST_SHARE = 0.3  # of the frames with a body: a flickering edge is rarer
-_FIXED = 0.5  # parts that are thin in more frames belong to the arena
-_FIXED_EDGE_PX = 2  # as do the mixed readings beside them
-_NEARLY = 1.00001  # allows for rounding
 
 
 @dataclass(frozen=True)
@@ -280,13 +269,14 @@ class Cable(Worn):
         Returns:
             None if too few frames show a cable that leads to something of an animal's size.
         """
-        cable = Cable(camera, floor, _TALLER * longest_mm)
+        cable = Cable(camera, floor, 1.2 * longest_mm)  # beyond the reach of the largest animal
         if not cable._rises(sample, limit):
             return None
         least_px = area_mm2 * camera.fx * camera.fy / floor.distance_mm**2
         found = [cable._leads_to_one(depth, limit, least_px) for depth in sample]
         with_one = [leads for leads in found if leads is not None]
-        return cable if with_one and np.mean(with_one) >= _CABLE_LEAST_SHARE else None
+        # of the frames with a body: a flickering edge is rarer
+        return cable if with_one and np.mean(with_one) >= 0.3 else None
 
     def with_fixed(self, sample: Depths, cut: Depths) -> Cable:
         """The same with the thin parts of the arena itself.
@@ -299,8 +289,9 @@ class Cable(Worn):
             A cable whose `fixed` marks the pixels that were cut in most frames.
         """
         share = np.mean([a != b for a, b in zip(sample, cut, strict=True)], axis=0)
-        edge = np.ones((2 * _FIXED_EDGE_PX + 1,) * 2, np.uint8)
-        return replace(self, fixed=cv2.dilate((share > _FIXED).astype(np.uint8), edge) > 0)
+        # the mixed readings beside them belong to the arena, too
+        edge = np.ones((5, 5), np.uint8)
+        return replace(self, fixed=cv2.dilate((share > 0.5).astype(np.uint8), edge) > 0)
 
     def every(self, step: int) -> Cable:
         """The same for every `step`-th row and column of the image."""
@@ -316,14 +307,15 @@ class Cable(Worn):
         """Whether anything in a sample (n, H, W) may reach higher than an animal."""
         with np.errstate(divide="ignore"):
             above = (1.0 - self.tall_mm / self.floor.distance_mm) / self._inverse
-        above = np.where(self._inverse > 0, _NEARLY * above, np.inf)
+        above = np.where(self._inverse > 0, 1.00001 * above, np.inf)  # allows for rounding
         nearer = np.minimum(above, limit).astype(np.float32)
         return any(bool(((depth > 0) & (depth < nearer)).any()) for depth in sample)
 
     def _cut_one(self, depth: Depths, height: Depths) -> None:
         wide = self._wide(height)
         body = wide[(wide > 0) & (wide < self.tall_mm)]
-        back = float(np.percentile(body, _BACK)) if len(body) else 0.0
+        # the back, as a quantile of the wide parts' heights
+        back = float(np.percentile(body, 95.0)) if len(body) else 0.0
         worn = np.zeros(depth.shape, np.bool_)
         for part in self._parts(height, wide):
             # a snout is as narrow as a cable, but no higher than the back
@@ -333,7 +325,8 @@ class Cable(Worn):
 
     def _parts(self, height: Depths, wide: Depths) -> Iterator[Mask]:
         """The cables of an image, one at a time."""
-        thin = (height - wide > _RISE_MM) | (height > self.tall_mm)
+        # a cable rises this far above its surroundings
+        thin = (height - wide > 6.0) | (height > self.tall_mm)
         if not (height > self.tall_mm).any():
             return
         reach = np.ones((2 * _LINK_PX + 1, 2 * _LINK_PX + 1), np.uint8)
@@ -341,7 +334,7 @@ class Cable(Worn):
         tall = np.unique(labels[thin & (height > self.tall_mm)])
         for k in tall[tall > 0]:
             run = max(stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT])
-            if run * self._px_mm >= _LEAST_RUN_MM:
+            if run * self._px_mm >= 40.0:  # its least extent in the image
                 yield thin & (labels == k)
 
     def _leads_to_one(self, depth: Depths, limit: Depths, least_px: float) -> bool | None:

@@ -12,20 +12,19 @@ outline are intersected with the floor, 1 / z = a u + b v + c.
 from __future__ import annotations
 
 import difflib
-import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, ValidationError, model_validator
 
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
-from liex_lab.plan.sections import Region
+from liex_lab.plan.sections import Circle, Corner, Region, SettingsTable
 from liex_lab.recordings.frame import region_mask
 from liex_lab.runtime.text_files import read_toml
 from liex_lab.scene.floor import Floor
@@ -65,10 +64,6 @@ def _side(p: Array, q: Array, r: Array) -> Array:
     )
 
 
-_N_CORNERS = 64  # of a circle
-_DEEPEST_SHARE = 1e-3  # least depth of a corner, as a share of the floor's distance
-
-
 def region_corners_px(
     region: Region, camera: Camera | None = None, floor: Floor | None = None
 ) -> Corners:
@@ -97,7 +92,7 @@ def region_corners_px(
         raise PlanError("a region in mm needs a floor; state it in pixels, or state arena.floor")
     on_floor = np.column_stack([corners, np.zeros(len(corners))])
     points = floor.T_arena_camera.inverse() @ on_floor
-    if (points[:, 2] < _DEEPEST_SHARE * floor.distance_mm).any():
+    if (points[:, 2] < 1e-3 * floor.distance_mm).any():
         raise PlanError(
             "arena.region has corners that lie behind the camera; millimetres are measured from "
             "the point of the floor below the camera"
@@ -108,7 +103,7 @@ def region_corners_px(
 def _drawn(region: Region) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     """The corners (n, 2) in the region's own unit."""
     if region.circle is not None:
-        return np.array(region.circle.centre) + region.circle.radius * circle_points(_N_CORNERS)
+        return np.array(region.circle.centre) + region.circle.radius * circle_points(64)
     if region.rectangle is not None:
         (x0, y0), (x1, y1) = region.rectangle
         return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], float)
@@ -147,7 +142,6 @@ def masks_apart(regions: Mapping[str, Corners], width: int, height: int) -> dict
 # Zones on the floor.
 
 SEPARATOR = ";"  # between the names of zones that overlap, in tables
-_KEYS = ("name", "circle", "polygon", "unit", "relative_to")
 _EXAMPLE = '[[zones]], name = "centre", circle = { centre = [0, 0], radius = 80 }'
 
 
@@ -225,26 +219,40 @@ def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
     return [SEPARATOR.join(name for name, is_in in inside if is_in[k]) for k in range(len(xy))]
 
 
-@dataclass(frozen=True)
-class DrawnZone:
-    """A zone as stated in a file: a circle about its only point, or a polygon.
+class DrawnZone(SettingsTable):
+    """A zone as stated in a file: a circle or a polygon.
 
     Attributes:
-        name: of the zone.
-        points: the circle's centre, or the polygon's corners, in `unit`.
-        radius: of the circle, in `unit`; None for a polygon.
+        name: of the zone; columns are named after it.
+        circle: its centre and radius, in `unit`.
+        polygon: its corners, in `unit`.
         unit: 'mm' of the arena frame, or 'px' of the depth image.
         relative_to: 'centre' for coordinates relative to the arena's centre and rotation; None
             otherwise.
-        where: its name in error messages.
     """
 
-    name: str
-    points: tuple[tuple[float, float], ...]
-    radius: float | None
-    unit: str
-    relative_to: str | None
-    where: str
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    circle: Circle | None = None
+    polygon: Annotated[list[Corner], Field(min_length=3)] | None = None
+    unit: Literal["mm", "px"] = "mm"
+    relative_to: Literal["centre"] | None = None
+
+    @model_validator(mode="after")
+    def _is_drawn(self) -> Self:
+        if (self.circle is None) == (self.polygon is None):
+            raise ValueError("should have either a circle or a polygon")
+        if self.unit == "px" and self.relative_to:
+            raise ValueError('should have relative_to only with unit = "mm"')
+        corners = np.array(self.polygon or [[0, 0], [1, 0], [0, 1]], float)
+        x, y = corners.T
+        if abs((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) < 1e-6:
+            raise ValueError("has a polygon whose corners enclose no area")
+        if (crossing := crossing_sides(corners)) is not None:
+            raise ValueError(
+                f"has a polygon whose sides {crossing[0] + 1} and {crossing[1] + 1} cross; list "
+                "its corners in order"
+            )
+        return self
 
     def placed(self, camera: Camera, floor: Floor, arena: Arena) -> Zone:
         """The zone in the arena frame, mm.
@@ -260,32 +268,43 @@ class DrawnZone:
             PlanError: the zone is drawn above the floor's horizon, or relative to the centre of an
                 arena whose walls were not found.
         """
-        points = np.array(self.points)
+        points = np.array([self.circle.centre] if self.circle else self.polygon, float)
         if self.unit == "px":
-            if self.radius is not None:  # a circle in the image is no circle on a tilted floor
-                points = points + self.radius * circle_points(64)
-            return Zone(self.name, polygon_mm=_pairs(self._on_floor(points, camera, floor)))
+            if self.circle:
+                points = points + self.circle.radius * circle_points(64)
+            inverse = floor.inverse_at(points[:, 0], points[:, 1])
+            if not (inverse > 0).all():
+                raise PlanError(
+                    f"arena.zones: the zone '{self.name}' reaches above the horizon of the floor; "
+                    "draw it on the floor"
+                )
+            on_floor = floor.T_arena_camera @ camera.unproject(points, 1.0 / inverse)
+            return Zone(self.name, polygon_mm=_pairs(on_floor[:, :2]))
         if self.relative_to is not None:
             if arena.centre_mm is None:
                 raise PlanError(
-                    f"{self.where} is relative to the arena's centre, but no walls were found; "
-                    "omit relative_to"
+                    f"arena.zones: the zone '{self.name}' is relative to the arena's centre, but "
+                    "no walls were found; omit relative_to"
                 )
             c = np.cos(arena.yaw_rad or 0.0)
             s = np.sin(arena.yaw_rad or 0.0)
             points = points @ np.array([[c, s], [-s, c]]) + np.array(arena.centre_mm)
-        if self.radius is None:
+        if self.circle is None:
             return Zone(self.name, polygon_mm=_pairs(points))
-        return Zone(self.name, circle_mm=(*_pairs(points)[0], self.radius))
+        return Zone(self.name, circle_mm=(*_pairs(points)[0], self.circle.radius))
 
-    def _on_floor(self, uv: Array, camera: Camera, floor: Floor) -> Array:
-        """Intersections (n, 2) mm of the view rays of pixels (n, 2) with the floor."""
-        inverse = floor.inverse_at(uv[:, 0], uv[:, 1])
-        if not (inverse > 0).all():
-            raise PlanError(
-                f"{self.where} reaches above the horizon of the floor; draw it on the floor"
-            )
-        return np.asarray((floor.T_arena_camera @ camera.unproject(uv, 1.0 / inverse))[:, :2])
+
+class _ZonesFile(SettingsTable):
+    """The zones in a TOML file."""
+
+    zones: list[DrawnZone] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _are_named(self) -> Self:
+        names = [zone.name for zone in self.zones]
+        if double := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"has two zones called '{double}'; give each a name of its own")
+        return self
 
 
 def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
@@ -307,108 +326,41 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     """
     file = Path(path)
     try:
-        table = read_toml(file)
+        return tuple(_ZonesFile.model_validate(read_toml(file)).zones)
     except FileNotFoundError:
         raise PlanError(
             f"there is no file {file} with zones; check the spelling of arena.zones"
         ) from None
+    except ValidationError as error:
+        raise PlanError(f"{file}: {_sentence(error)}") from None
     except (ValueError, IsADirectoryError) as error:
         raise PlanError(
             f"{file} should be a TOML file with zones, but it is not ({error}); correct it"
         ) from None
-    entries: Any = table.get("zones")
-    _require(
-        isinstance(entries, list) and entries and set(table) == {"zones"},
-        f"{file} should contain only zones, each beginning with [[zones]]; as in {_EXAMPLE}",
-    )
-    zones = [_zone(file, number, entry) for number, entry in enumerate(entries, start=1)]
-    names = [zone.name for zone in zones]
-    if double := next((name for name in names if names.count(name) > 1), None):
-        raise PlanError(f"{file} has two zones called '{double}'; give each a name of its own")
-    return tuple(zones)
 
 
-def _require(holds: Any, sentence: str) -> None:
-    """Refuse a file with a sentence for the reader unless a condition holds."""
-    if not holds:
-        raise PlanError(sentence)
-
-
-def _zone(file: Path, number: int, entry: Any) -> DrawnZone:
-    where = f"zone {number} of {file}"
-    _require(
-        isinstance(entry, dict),
-        f"{where} should be a table with a name and a circle or a polygon; as in {_EXAMPLE}",
-    )
-    for key in entry:
-        near = difflib.get_close_matches(key, _KEYS, 1, cutoff=0.0)[0]
-        _require(
-            key in _KEYS, f"{where} has an unknown key '{key}'; the nearest known key is {near}"
-        )
-    name = entry.get("name")
-    _require(
-        isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name),
-        f"{where} needs a name of letters, digits and _, for columns are named after it, got "
-        f"{name!r}",
-    )
-    where = f"zone '{name}' of {file}"
-    unit, relative = entry.get("unit", "mm"), entry.get("relative_to")
-    _require(
-        (unit == "mm" and relative in (None, "centre")) or (unit == "px" and relative is None),
-        f'{where} should have unit = "mm" or "px", and only with mm optionally relative_to = '
-        '"centre"; correct it',
-    )
-    _require(
-        ("circle" in entry) != ("polygon" in entry),
-        f"{where} should have either a circle or a polygon; as in {_EXAMPLE}",
-    )
-    if "polygon" in entry:
-        corners = _pairs(_polygon(where, entry["polygon"]))
-        return DrawnZone(name, corners, None, unit, relative, where)
-    circle = entry["circle"]
-    _require(
-        isinstance(circle, dict) and set(circle) == {"centre", "radius"},
-        f"{where}: a circle is written as {{ centre = [0, 0], radius = 80 }}, got {circle!r}",
-    )
-    radius = circle["radius"]
-    _require(
-        _is_number(radius) and radius > 0,
-        f"{where}: the radius of a circle is a positive number, got {radius!r}",
-    )
-    centre = _point(where, circle["centre"])
-    return DrawnZone(name, (centre,), float(radius), unit, relative, where)
-
-
-def _polygon(where: str, polygon: Any) -> Array:
-    """The validated corners (n, 2) of a polygon."""
-    _require(
-        isinstance(polygon, list) and len(polygon) >= 3,
-        f"{where}: a polygon is a list of at least three corners [x, y], got {polygon!r}",
-    )
-    corners = np.array([_point(where, corner) for corner in polygon])
-    ends = np.roll(corners, -1, axis=0)
-    _require(
-        abs((corners[:, 0] * ends[:, 1] - corners[:, 1] * ends[:, 0]).sum()) >= 1e-6,
-        f"{where}: the corners of the polygon enclose no area; correct them",
-    )
-    if (crossing := crossing_sides(corners)) is not None:
-        raise PlanError(
-            f"{where}: sides {crossing[0] + 1} and {crossing[1] + 1} of the polygon cross; list "
-            "its corners in order"
-        )
-    return corners
-
-
-def _point(where: str, value: Any) -> tuple[float, float]:
-    _require(
-        isinstance(value, list) and len(value) == 2 and all(map(_is_number, value)),
-        f"{where}: a point is a pair of numbers [x, y], got {value!r}",
-    )
-    return float(value[0]), float(value[1])
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _sentence(error: ValidationError) -> str:
+    """The errors of a file as one sentence on the first of them; a misspelt key is the first."""
+    first = min(error.errors(include_url=False), key=lambda one: one["type"] != "extra_forbidden")
+    loc = [part + 1 if isinstance(part, int) else part for part in first["loc"]]
+    where = " ".join(map(str, loc)) or "the file"
+    if first["type"] == "extra_forbidden":
+        known = DrawnZone.model_fields if len(loc) > 1 else _ZonesFile.model_fields
+        near = difflib.get_close_matches(str(loc[-1]), known, 1, cutoff=0.0)[0]
+        return f"{where} is an unknown key; the nearest known key is {near}"
+    message = first["msg"].removeprefix("Value error, ")
+    for pydantic, own in (
+        ("Input should", "should"),
+        ("Field required", "is missing"),
+        (
+            "String should match pattern",
+            "should be letters, digits and _:",
+        ),
+        ("a valid dictionary or instance of", "a table, a"),
+    ):
+        message = message.replace(pydantic, own)
+    got = "" if first["type"] in ("value_error", "missing") else f", got {first['input']!r}"
+    return f"{where} {message}{got}; as in {_EXAMPLE}"
 
 
 def _pairs(points: Array) -> tuple[tuple[float, float], ...]:

@@ -21,32 +21,11 @@ from liex_lab.tracking.trust import head_tail_weight, together, usual_pixels
 
 Array = NDArray[np.float64]
 
-_BEAM = 24  # chains kept in the beam
-_JOINTS = 8  # joints used to measure an animal's displacement
 _BLOCK = 16_384  # frames in memory at once
 _BESIDE = 256  # and context frames, for velocities
-# the effect of an animal's build on the metric is estimated from sampled frames in which the body
-# covers the outline, is hardly outside it, and is near the readings (over the length)
-_SAMPLE = 2048
-_FEWEST = 12
-_AGREES_COVERED = 0.5
-_AGREES_BESIDE = 0.3
-_AGREES_RESIDUAL = 0.06
-# largest median score of the best pose of a known build in a recording, nats
-_ORDINARY = 2.5
-# largest speed of backward motion, body lengths/s; cost of twice that speed, nats/s; larger speeds
-# are jumps to another object
+_FEWEST = 12  # frames for an estimate
 _AROUND_S = 0.2
-_BACKS_UP = 0.6
-_BACKWARD = 60.0
-_JUMPS = 25.0
-# correlation time of the metric's evidence on head and tail, s
-_ALIKE_S = 0.1
-# several animals differ only in position: a jump costs up to this multiple of a transition's
-# ceiling
-_OTHER = 20.0
-# share of the missed-detection cost in frames in which they touch
-_TOGETHER = 0.1
+_BACKS_UP = 0.6  # largest speed of backward motion, body lengths/s
 NONE = kernels.NONE
 
 
@@ -77,9 +56,9 @@ class HypothesisAssociation:
         self._length_mm = length_mm
         self._score_mm = tuning.score_mm * skeleton.relative_size
         n = skeleton.n_joints
-        self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, _JOINTS))})
+        self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, 8))})
         t = tuning
-        jump = t.ceiling * (1.0 if self._alone else _OTHER)
+        jump = t.ceiling * (1.0 if self._alone else 20.0)  # several animals differ only in position
         costs = t.error_factor, t.shift, t.bend, t.tail, t.ceiling, jump, length_mm
         self._costs = kernels.TransitionCosts(*map(float, costs))
 
@@ -122,10 +101,13 @@ class HypothesisAssociation:
         missed = np.where(observed.known.any(axis=1), self._tuning.none, 0.0)
         if not self._alone:  # the pose of touching animals may be that of any of them
             first = np.where(observed.known[:, 0], 0, NONE)
-            missed[together(observed, first, usual_pixels(observed, first))] *= _TOGETHER
+            missed[together(observed, first, usual_pixels(observed, first))] *= (
+                0.1  # cheaper to skip
+            )
         missed_cost = np.concatenate([[0.0], np.cumsum(missed)])
         parent = allocate((n, h, 2), np.int64)
-        chains = kernels.Chains(np.zeros((_BEAM, 2), np.int64), allocate((n, h), float), parent)
+        # 24 chains are kept
+        chains = kernels.Chains(np.zeros((24, 2), np.int64), allocate((n, h), float), parent)
         frames = kernels.Hypotheses(
             observed.seconds, joints, observed.error_mm, emission, missed_cost
         )
@@ -186,7 +168,8 @@ class HypothesisAssociation:
         """
         if len(observed) < 2:
             return 1.0
-        return float(min(1.0, np.median(np.diff(observed.seconds)) / _ALIKE_S))
+        # the metric's evidence on head and tail is correlated over a tenth of a second
+        return float(min(1.0, np.median(np.diff(observed.seconds)) / 0.1))
 
     def _strangeness(self, observed: Observations) -> float:
         """Ratio of the metric's scores of this animal to ordinary scores, 1 or more.
@@ -197,18 +180,20 @@ class HypothesisAssociation:
         scores therefore grows by the square of this factor: the median of the best scores in frames
         whose depth image agrees, over the ordinary score.
         """
-        some = observed[:: max(1, len(observed) // _SAMPLE)]
+        some = observed[:: max(1, len(observed) // 2048)]
         best = np.where(some.known, some.score, np.inf).argmin(axis=1)
         with np.errstate(invalid="ignore"):
+            # the body covers the outline, is hardly outside it, and is near the readings
             agrees = (
-                (some.along(some.covered, best) > _AGREES_COVERED)
-                & (some.along(some.beside, best) < _AGREES_BESIDE)
-                & (some.along(some.residual_mm, best) < _AGREES_RESIDUAL * self._length_mm)
+                (some.along(some.covered, best) > 0.5)
+                & (some.along(some.beside, best) < 0.3)
+                & (some.along(some.residual_mm, best) < 0.06 * self._length_mm)
             )
         if agrees.sum() < _FEWEST:
             return 1.0
         usual = float(np.median(some.along(some.score, best)[agrees]))
-        return max(1.0, usual / (_ORDINARY * self._score_mm))
+        # the largest median score of a known build, nats
+        return max(1.0, usual / (2.5 * self._score_mm))
 
     def doubt(
         self,
@@ -274,23 +259,21 @@ def backward_cost(observed: Observations, ahead: NDArray[np.float32], length_mm:
         velocity = (centre[last] - centre[first]) / (seconds[last] - seconds[first])[:, None, None]
         backward = -(velocity * ahead).sum(axis=-1) / np.linalg.norm(ahead, axis=-1)
         share = np.clip((backward - _BACKS_UP) / _BACKS_UP, 0.0, 1.0)
-        share[~(np.linalg.norm(velocity, axis=-1) < _JUMPS)] = 0.0
+        # faster ones are jumps to another object
+        share[~(np.linalg.norm(velocity, axis=-1) < 25.0)] = 0.0
     # only the heading is in question, not the identity
     other = np.arange(share.shape[1]) ^ 1
     share = np.where(observed.known & observed.known[:, other], np.nan_to_num(share), 0.0)
     share -= np.minimum(share, share[:, other])
     step = np.minimum(np.diff(seconds, prepend=seconds[:1]), _AROUND_S)
-    return np.asarray(_BACKWARD * step[:, None] * share)
+    # 60 nats/s at twice that speed
+    return np.asarray(60.0 * step[:, None] * share)
 
 
 # Selection of one of two animals in view by size, if their sizes differ.
 
 
-_LEAST = 0.08  # smallest logarithm of the ratio of their pixels
-_NOISE = 0.08  # smallest standard deviation of it
-_IN_ORDER = 0.9  # share of the frames with both apart in which the same one is larger
 _MOST = 2.0  # largest evidence of a frame, nats
-_CLEARLY = 1.5  # ratio of residuals that indicates another body
 
 
 def cost_of_the_other(observed: Observations, path: NDArray[np.int64]) -> Array | None:
@@ -316,10 +299,11 @@ def cost_of_the_other(observed: Observations, path: NDArray[np.int64]) -> Array 
         return None
     size = np.abs(ratio[apart])
     usual = float(np.median(size))
-    noise = max(_NOISE, 1.4826 * float(np.median(np.abs(size - usual))))
+    noise = max(0.08, 1.4826 * float(np.median(np.abs(size - usual))))
     followed = apart & (path >= 0)
     own = np.where(path >= 2, -ratio, ratio)[followed]
-    if usual < _LEAST or not len(own) or not _keeps_order(own, np.flatnonzero(followed)):
+    # smaller differences are none
+    if usual < 0.08 or not len(own) or not _keeps_order(own, np.flatnonzero(followed)):
         return None
     fits = _better_fit(observed, ratio, apart)
     is_larger = fits or (1.0 if own.sum() > 0.0 else -1.0)
@@ -342,7 +326,8 @@ def _better_fit(observed: Observations, ratio: Array, apart: NDArray[np.bool_]) 
     if known.sum() < _FEWEST:
         return 0.0
     off = float(np.log(np.median(smaller[known]) / max(np.median(larger[known]), 1e-9)))
-    return float(np.sign(off)) if abs(off) > np.log(_CLEARLY) else 0.0
+    # a larger ratio indicates another body
+    return float(np.sign(off)) if abs(off) > np.log(1.5) else 0.0
 
 
 def _keeps_order(own: Array, frames: NDArray[np.int64]) -> bool:
@@ -356,4 +341,4 @@ def _keeps_order(own: Array, frames: NDArray[np.int64]) -> bool:
     begins = np.concatenate([[0], np.flatnonzero(np.diff(frames) > 1) + 1])
     n = np.diff(np.append(begins, len(own)))
     larger = np.add.reduceat((own > 0).astype(int), begins)
-    return bool(np.maximum(larger, n - larger).sum() >= _IN_ORDER * len(own))
+    return bool(np.maximum(larger, n - larger).sum() >= 0.9 * len(own))

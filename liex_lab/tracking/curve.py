@@ -63,10 +63,6 @@ from liex_lab.tracking.trust import (
 
 Mask = NDArray[np.bool_]
 
-_MUCH = 0.1  # share of frames; a longer freeze needs review
-_FEW = 5  # frames that may repeat in a recording without noise
-_SOON = 0.9  # of a step: too short for a new image
-
 
 def polled_twice(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> Mask:
     """Which copies (n,) result from polling faster than the frame rate; in others the stream froze.
@@ -82,7 +78,7 @@ def polled_twice(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> Mask
     step_s = median_step(times_ns[~copies]) * 1e-9
     between = whole_gaps(seconds, known, GAP_FACTOR * step_s)
     last = np.flatnonzero(known)[-1:]  # no image follows it, and its copies end with the recording
-    if len(last) and seconds[-1] - seconds[last[0]] < _SOON * step_s:
+    if len(last) and seconds[-1] - seconds[last[0]] < 0.9 * step_s:  # too short for a new image
         between[last[0] + 1 :] = True
     return copies & between
 
@@ -108,7 +104,7 @@ def repeat_messages(
             f"each depth image is there {times}: the camera made {true_hz:.2f} frames/s, not "
             f"{hz:.2f}; each image counts once"
         )
-    if (n := int(still.sum())) >= (1 if noisy else _FEW):
+    if (n := int(still.sum())) >= (1 if noisy else 5):  # some may repeat without noise
         stops = np.append(times_ns[1:], times_ns[-1] + median_step(times_ns))
         lasted = [(1e-9 * (stops[b - 1] - times_ns[a]), a) for a, b in spans(still)]
         longest_s, at = max(lasted)
@@ -123,7 +119,7 @@ def repeat_messages(
                 "animal that keeps still: watch that part of the replay"
             )
         else:
-            (reasons if n > _MUCH * len(still) else cautions).append(
+            (reasons if n > 0.1 * len(still) else cautions).append(  # a longer freeze needs review
                 f"the stream froze: {message}; nothing is measured there"
             )
     return reasons, cautions
@@ -134,15 +130,6 @@ Array = NDArray[np.float64]
 # frames smoothed at once, and context frames on either side
 _BLOCK = 4096
 MARGIN = 160
-# a skipped hypothesis within this many predicted errors (its own and the curve's) of the curve is
-# accepted after all, unless its area is below this share or above this multiple of the animal's
-# usual area; the pose of a partly hidden animal errs by this share of the hidden length. Repeated,
-# as each pass moves the curve nearer to others.
-_ADMIT = 1.0
-_SIZES = (0.5, 1.5)
-_HIDDEN = 0.4
-_TIMES = 2
-_LEAST_DOUBT = 0.05  # a smaller doubt about head and tail is not reported
 
 
 def track_whole(
@@ -202,7 +189,7 @@ def track_whole(
 
     for rows in blocks(len(observed), _BLOCK):
         draw(rows)
-    for _ in range(_TIMES):
+    for _ in range(2):  # twice, as each pass moves the curve nearer to others
         taken = path == NONE
         for rows in blocks(len(observed), _BLOCK):
             _admit(subject, observed[rows], path[rows], error[rows], track[rows], usual_px)
@@ -343,10 +330,13 @@ def _admit(
     curve's combined, and has 0.5 to 1.5 times the usual pixels: the pose of half an animal is
     unknown, as is the curve in a gap.
     """
-    best = np.full(len(observed), _ADMIT)
+    best = np.full(len(observed), 1.0)
     passed = (path == NONE) & np.isfinite(track.predicted_error_mm)
-    for h, rows, shown, distance in distances(observed, track.joints_mm, passed, usual_px, _SIZES):
-        hidden_mm = _HIDDEN * subject.length_mm * np.maximum(1.0 - shown, 0.0)
+    for h, rows, shown, distance in distances(
+        observed, track.joints_mm, passed, usual_px, (0.5, 1.5)
+    ):
+        # a pose errs by this share of the hidden length
+        hidden_mm = 0.4 * subject.length_mm * np.maximum(1.0 - shown, 0.0)
         own = np.hypot(observed.error_mm[rows, h], hidden_mm)
         relative = distance / np.hypot(own, track.predicted_error_mm[rows])
         better = relative < best[rows]
@@ -367,16 +357,11 @@ def _flips(observed: Observations, track: Track) -> list[Flip]:
         exchanged[rows] = np.einsum("nd,nd->n", along, ends[:, 1] - ends[:, 0]) < 0
     exchanged = exchanged[observed.shown]
     found = [Flip(a, b, float(1.0 - track.p_flip[a:b].mean()), True) for a, b in spans(exchanged)]
-    unsure = ~exchanged & (track.p_flip > _LEAST_DOUBT)
+    unsure = ~exchanged & (track.p_flip > 0.05)  # a smaller doubt is not reported
     return found + [Flip(a, b, float(track.p_flip[a:b].mean()), False) for a, b in spans(unsure)]
 
 
 # Fixed-lag smoothing of an ongoing recording.
-
-
-# frames used to choose the hypothesis, and frames before the current one used to smooth
-_WINDOW = 48
-_BEFORE = 20
 
 
 class OnlineTracker:
@@ -420,7 +405,7 @@ class OnlineTracker:
         rows = []
         for k in range(len(observed)):
             frame = observed[k : k + 1]
-            gone = max(0, len(self._window) + 1 - _WINDOW)
+            gone = max(0, len(self._window) + 1 - 48)  # frames that decide on the hypothesis
             self._window = Observations.join([self._window, frame])[gone:]
             self._joints = np.concatenate([self._joints, self._chain.joints(frame)])[gone:]
             self._path = np.append(self._path[gone:], NONE)
@@ -442,7 +427,7 @@ class OnlineTracker:
         self._path[done : done + n] = path[done : done + n]
         self._n_returned += n
         doubt = self._chain.doubt(observed, path, joints, emission)
-        first = max(0, done - _BEFORE)
+        first = max(0, done - 20)  # earlier frames that are smoothed, too
         if (path[first:] == NONE).all():  # all observations of the animal are older
             first = 0
         observed, path, doubt = observed[first:], path[first:], doubt[first:]

@@ -25,7 +25,6 @@ from liex_lab.tracking.observations import joints_of
 
 Array = NDArray[np.float64]
 
-_NEARER_MM = 25.0  # an object nearer than the animal's edge by this much is in front of it
 _REACH_PX = 3  # pixels next to the edge, often unread by a sensor
 
 
@@ -47,7 +46,7 @@ def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
         crops.origin,
         crops.step,
         depths,
-        _NEARER_MM,
+        25.0,  # mm nearer than the animal's edge is in front of it
         _REACH_PX,
         out,
     )
@@ -106,11 +105,7 @@ def is_behind(depth, v, u, dv, du, nearer, reach_px):
     return False
 
 
-_BEFORE = 2.0  # square roots of the animal's area: an object nearer by this much is in front of it
 _WHOLE = 0.95  # of the animal's usual area: it is completely visible
-# of half the visible part: without an obstruction this far to one end, the hidden end is unknown
-_ASIDE = 0.25
-_SLIDE = 0.45  # of the hidden share: largest shift of a chain fitted to the visible rest
 
 
 @dataclass(frozen=True)
@@ -173,10 +168,11 @@ class OcclusionCorrection:
         """
         joints = joints_of(self.skeleton, pose)
         shown, covered, aside, begins, ends = self._sight(joints, crops, depths).T
-        most = _SLIDE * np.clip(1.0 - shown, 0.0, 1.0)
+        most = 0.45 * np.clip(1.0 - shown, 0.0, 1.0)
         forwards = np.clip(begins - self.begins, 0.0, most)
         direction = np.where(aside > 0, forwards, np.clip(ends - self.ends, -most, 0.0))
-        direction[(covered == 0) | (np.abs(aside) < _ASIDE) | (shown > _WHOLE)] = 0.0
+        # nearer to the middle, the hidden end is unknown
+        direction[(covered == 0) | (np.abs(aside) < 0.25) | (shown > _WHOLE)] = 0.0
         along = joints[:, self.skeleton.tip] - joints[:, 0]
         place = pose.root.translation + direction[:, None] * along
         return replace(pose, root=SE3(pose.root.rotation, place))
@@ -189,7 +185,8 @@ class OcclusionCorrection:
         camera = self.scene.camera
         ends = camera.project(joints[:, [0, self.skeleton.tip]])
         out = np.zeros((len(ends), 5))
-        before = _BEFORE * float(np.sqrt(self.scene.area_mm2))
+        # an object nearer by this much is in front of the animal
+        before = 2.0 * float(np.sqrt(self.scene.area_mm2))
         in_parallel(
             _look,
             len(ends),

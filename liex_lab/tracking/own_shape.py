@@ -35,7 +35,6 @@ from liex_lab.tracking.trust import finite_median
 Array = NDArray[np.float64]
 
 FEWEST_FRAMES = 50
-_HELD_OUT = 3  # every third frame is held out from the fit
 
 
 @dataclass(frozen=True)
@@ -162,7 +161,7 @@ def fit_shape(
         return pose.moved(scene.floor.T_arena_camera)
 
     if stated is None or stated.labels is None:
-        held_out = good[::_HELD_OUT]
+        held_out = good[::3]  # every third frame is held out from the fit
         fitted = np.setdiff1d(good, held_out)
         cameras = scene.crop_cameras(estimates.crops, camera_view)[fitted]
         pose = estimates.chosen.pose[fitted].moved(view_of(cameras))
@@ -209,7 +208,6 @@ def borne_out(before: Array, after: Array) -> bool:
 
 
 MOST_APART = 0.08  # of the median length: a larger difference means growth, or another animal
-_LEAST_SD = 0.001  # of the length: smallest standard deviation of a session's estimate
 
 
 @dataclass(frozen=True)
@@ -285,7 +283,7 @@ def _length(measured: Sequence[SessionBody]) -> float:
     each session's own frames, and one between sessions, by the method of moments.
     """
     y = [math.log(one.spine_mm) for one in measured]
-    own = [max(one.log_sd**2 / max(one.n_frames, 1), _LEAST_SD**2) for one in measured]
+    own = [max(one.log_sd**2 / max(one.n_frames, 1), 0.001**2) for one in measured]
     between = 0.0
     if len(y) > 1:
         v = [1.0 / variance for variance in own]

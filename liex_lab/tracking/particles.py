@@ -31,8 +31,6 @@ from liex_lab.scene.height_maps import Segmenter, view_of
 
 Array = NDArray[np.float64]
 
-_AVERAGING_PASSES = 10
-
 
 @dataclass(frozen=True)
 class ProcessNoise:
@@ -219,7 +217,7 @@ class ParticleFilter:
         base = SE3(rotations[:, 0], positions[:, 0])
         best = int(np.argmax(weight))
         root = SE3(base.rotation[best], base.translation[best])
-        for _ in range(_AVERAGING_PASSES):
+        for _ in range(10):
             step = weight @ (root.inverse() @ base).log()
             root = root @ SE3.exp(step)
             if np.linalg.norm(step) < 1e-9:

@@ -31,13 +31,6 @@ from liex_lab.tracking.trust import MOST_ERROR, MOST_RESIDUAL, finite_median
 
 Array = NDArray[np.float64]
 
-_GIRTHS = np.linspace(0.75, 1.35, 13)  # of the default body at the animal's size
-_MIN_OVERLAP_PX = 20
-# a part with fewer pixels, or a smaller share of all that both cover, is ignored: one wrong finger
-# does not make the hand wrong
-_MIN_PART_PX = 8
-_MIN_PART = 0.05
-
 
 @dataclass(frozen=True)
 class BodyAgreement:
@@ -151,7 +144,7 @@ class BodyResidual:
         placed = pose_arena.placed(surface.skeleton)
         best = BodyResidual(surface, camera_view=camera_view, size=size)
         least = np.inf
-        for girth in _GIRTHS:
+        for girth in np.linspace(0.75, 1.35, 13):  # of the default body at the animal's size
             body = BodyResidual(surface, float(girth), camera_view, size)
             cost = finite_median(body.of(placed, crops, scene), np.inf)
             if cost < least:
@@ -219,7 +212,7 @@ def _compare(rendered, heights, origin, step, planes, distance, joints, out, sta
                     offset[n] = abs(rendered[i, r, c] - observed)
                     part[n] = _nearest(joints[i], u, v)
                     n += 1
-        enough = n >= _MIN_OVERLAP_PX
+        enough = n >= 20
         for k in range(n):
             own[k] = offset[k]
         out[0, i] = median_of(own[:n]) if enough else np.nan
@@ -253,7 +246,7 @@ def _worst_part(offset, part, n_parts, own):
             if part[k] == j:
                 own[n] = offset[k]
                 n += 1
-        if n >= max(_MIN_PART_PX, _MIN_PART * len(offset)):
+        if n >= max(8, 0.05 * len(offset)):  # one wrong finger does not make the hand wrong
             worst = max(worst, median_of(own[:n]))
     return worst
 
@@ -298,11 +291,7 @@ def median_of(values):
 
 # of the plan's lengths: sizes are measured to a few per cent, and plans contain round numbers
 _SIZE_MARGIN = 0.15
-_LEAST_COVERED = 0.4
 _MOST_BESIDE = 0.5
-_LEAST_FOUND = 0.05
-# a second object is also an animal if its body fits as well as the first's usually does
-_TWIN_SHARE = 0.2  # of the frames: excludes a passing hand
 
 
 @dataclass(frozen=True)
@@ -351,7 +340,7 @@ class SampleFit:
                 f"it is {self.spine_mm:.0f} mm long and the plan expects {low_mm:g} to "
                 f"{high_mm:g} mm"
             )
-        if self.n_found < _LEAST_FOUND * self.n_frames:
+        if self.n_found < 0.05 * self.n_frames:
             found.append(
                 f"something of its size was found in {self.n_found} of {self.n_frames} frames"
             )
@@ -366,7 +355,7 @@ class SampleFit:
                 if np.isnan(self.residual_mm)
                 else f"its body lies {self.residual_mm:.0f} mm from what was read"
             )
-        if self.covered < _LEAST_COVERED:
+        if self.covered < 0.4:
             found.append(f"its body covers {self.covered:.0%} of the outline that is seen")
         if self.beside > _MOST_BESIDE:
             found.append(f"{self.beside:.0%} of its body lies beside that outline")
@@ -391,4 +380,4 @@ def count_animals(
         & (second.covered >= 0.8 * np.median(first.covered))
         & (second.beside <= _MOST_BESIDE)  # a shorter animal fills less of a body of this length
     )
-    return 2 if alike.sum() >= max(2.0, _TWIN_SHARE * n) else 1
+    return 2 if alike.sum() >= max(2.0, 0.2 * n) else 1  # of the frames: excludes a passing hand

@@ -503,9 +503,6 @@ def _curve(
 
 
 _REACH = 160  # frames on either side that may move
-_CERTAIN = 1e-3  # error of a correction over a frame's predicted error
-_HALVINGS = 10  # bisection steps of the share by which a frame can move above the floor
-_LEAST_MM = 0.02  # poses that would move less are unchanged
 _LEAST_ERROR = 0.005  # smallest error of a frame, over the length
 
 
@@ -547,7 +544,7 @@ def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> R
     error = np.nan_to_num(track.predicted_error_mm[rows], nan=np.inf)
     error = np.maximum(error, _LEAST_ERROR * length)
     error[track.bridged[rows] & ~placed] = np.inf
-    error[placed] = _CERTAIN * _LEAST_ERROR * length
+    error[placed] = 1e-3 * _LEAST_ERROR * length
     seconds = (track.times_ns[rows] - track.times_ns[rows[0]]) * 1e-9
     weight = np.ones(len(rows))
     nu = motion.degrees_of_freedom
@@ -559,13 +556,14 @@ def _follow(track: Track, was: Pose, rows: Rows, placed: NDArray[np.bool_]) -> R
     lowest = np.minimum(joints_were[..., 2], 0.0)
     share = high = np.ones((len(rows), 1))
     low = np.zeros((len(rows), 1))  # the share of the move that keeps a frame above the floor
-    for _ in range(_HALVINGS):
+    for _ in range(10):  # bisection
         joints = _moved(track, was, rows, share * moved).joints(skeleton)
         above = (joints[..., 2] >= lowest).all(axis=1, keepdims=True)
         low, high = np.where(above, share, low), np.where(above, high, share)
         share = 0.5 * (low + high)
     pose = _moved(track, was, rows, low * moved)
-    far = np.linalg.norm(pose.joints(skeleton) - joints_were, axis=-1).max(axis=1) > _LEAST_MM
+    # poses that would move less are unchanged
+    far = np.linalg.norm(pose.joints(skeleton) - joints_were, axis=-1).max(axis=1) > 0.02
     chosen = np.flatnonzero(far & ~placed)
     track.put_pose(rows[chosen], pose[chosen])
     return rows[chosen]

@@ -27,7 +27,6 @@ from liex_lab.tracking.trust import (
 
 Array = NDArray[np.float64]
 
-MEAN_PER_SD = 0.8  # the mean of |x| over the standard deviation of a Gaussian x, sqrt(2 / pi)
 # mean 3D distance over the standard deviation along one axis: 1.6 for a Gaussian, but tails are
 # heavier
 ERROR_PER_SD = 1.4
@@ -142,7 +141,8 @@ def write_curve(
     # sd_mm applies to speeds and headings, which constant errors do not change
     track.sd_xy_mm[:] = np.hypot(track.sd_mm, np.sqrt(0.5) * shift)
     track.sd_z_mm[:] = np.hypot(track.sd_mm, height)
-    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), MEAN_PER_SD * np.hypot(height, shift))
+    # of |x| for a Gaussian x, 0.8 is the mean over the standard deviation, sqrt(2 / pi)
+    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), 0.8 * np.hypot(height, shift))
     track.predicted_error_mm[:] = np.hypot(curve.error_mm, constant)
     calibration = np.array(motion.root_calibration)
     R = pose.root.rotation

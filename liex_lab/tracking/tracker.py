@@ -37,8 +37,6 @@ from liex_lab.tracking.track import Flip, Subject, Tracked
 from liex_lab.tracking.trust import WHOLE, finite_median, median_of_whole, visible_share
 
 BRIDGE_S = 0.5
-_MOST_COUNTED = 24  # frames in which animals are counted
-_FEWEST_WHOLE = 20  # this many frames of a fully visible animal are enough to estimate its size
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ class FrameTracker:
         size = spine_mm / home if spine_mm else estimator.find_size(sample, scene)
         estimates = estimator.estimate(sample, scene, size)
         whole = _whole(scene, sample, estimates)
-        if whole.sum() < len(whole) and (whole & estimates.found).sum() >= _FEWEST_WHOLE:
+        if whole.sum() < len(whole) and (whole & estimates.found).sum() >= 20:  # enough frames
             # the length of a partly hidden animal is unknown
             sample = sample[whole]
             size = size if spine_mm else estimator.find_size(sample, scene)
@@ -342,7 +340,8 @@ def _count(
     if not isinstance(scene, BackgroundSubtraction):
         return 1
     unsure = np.flatnonzero(n_candidates > 1)
-    rows = unsure[np.linspace(0, len(unsure) - 1, min(len(unsure), _MOST_COUNTED)).astype(int)]
+    # frames in which animals are counted
+    rows = unsure[np.linspace(0, len(unsure) - 1, min(len(unsure), 24)).astype(int)]
     if not len(rows):
         return 1
     other = estimator.hypotheses(sample[rows], scene, size)[2]
@@ -361,9 +360,6 @@ def _count(
 
 
 Array = NDArray[np.float64]
-
-_SIZE_PASSES = 4
-_SURE = 0.5  # share of frames that determine the size: those with the highest confidence
 
 
 @dataclass(frozen=True)
@@ -392,13 +388,13 @@ class PatchObserver:
         model = self.estimator.model
         size = 1.0
         uncorrected = replace(self.estimator, model=replace(model, corrector=None))
-        for _ in range(_SIZE_PASSES if model.method.session_size else 0):
+        for _ in range(4 if model.method.session_size else 0):
             best = uncorrected.best_of(*self._cut(windows, size), size)
             found = np.flatnonzero(best.found)
             if not len(found):
                 return 1.0
             order = np.argsort(-best.chosen.scale_trust[found])
-            sure = found[order[: max(8, int(_SURE * len(found)))]]
+            sure = found[order[: max(8, int(0.5 * len(found)))]]
             size = float(np.median(best.chosen.frame_scale[sure]))
         return size
 

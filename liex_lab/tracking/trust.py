@@ -25,32 +25,15 @@ Array = NDArray[np.float64]
 # of the animal's length
 MOST_ERROR = 0.25
 MOST_RESIDUAL = 0.12
-_ALWAYS_RESIDUAL = 0.04  # a smaller residual is never a contradiction, even in a low-noise session
-_TIMES_RESIDUAL = 4.0  # of the session's own usual residual
-_LEAST_COVERED = 0.35
-_MOST_BESIDE = 0.6
 # smallest and largest share of the usual pixels of a fully visible animal
 _SHOWN = (0.6, 1.6)
-# one object is two animals if it has the usual pixels plus this share of the other's, and at least
-# this multiple of the usual ones: where both touch, each hides a part of the other
-_OF_OTHER = 0.4
-_LEAST_TOGETHER = 1.25
 # an animal is partly hidden if this share of its outline ends at an obstruction and it has less
 # than this share of its usual pixels; an obstruction lasts for some frames
 _BEHIND = 0.03
-_FEWEST_WHOLE = 12  # unobstructed frames needed to estimate an animal's usual pixels
 WHOLE = 0.95
 _FRAMES = 2  # before and after
 MOSTLY = 0.7  # share that must be visible to determine its posture
-_UNSURE = 0.25  # flip probability above which all of it must be visible
-# it disappeared behind something if less than this share was visible shortly before
-_GOING = 0.8
-_SHORTLY_S = 0.5
-_REMEMBERED = 900  # measured frames that determine its usual pixels online
-# a pose has strayed if its joints are this far from every hypothesis of its frame, in predicted
-# errors and over the length
-_TIMES_ERROR = 4.0
-_ELSEWHERE = 0.25
+_SHORTLY_S = 0.5  # before it disappeared behind something, less and less of it was visible
 
 
 def contradicted(
@@ -68,15 +51,14 @@ def contradicted(
     """
     residual = observed.along(observed.residual_mm, path)
     usual = finite_median(residual, 0.0)
-    limit = min(
-        max(_TIMES_RESIDUAL * usual, _ALWAYS_RESIDUAL * length_mm), MOST_RESIDUAL * length_mm
-    )
+    # a smaller residual is never a contradiction, even in a low-noise session
+    limit = min(max(4.0 * usual, 0.04 * length_mm), MOST_RESIDUAL * length_mm)
     with np.errstate(invalid="ignore"):
         return np.asarray(
             (residual > limit)
             | (observed.along(observed.part_mm, path) > MOST_RESIDUAL * length_mm)
-            | (observed.along(observed.covered, path) < _LEAST_COVERED)
-            | (observed.along(observed.beside, path) > _MOST_BESIDE)
+            | (observed.along(observed.covered, path) < 0.35)
+            | (observed.along(observed.beside, path) > 0.6)
         )
 
 
@@ -115,7 +97,7 @@ def median_of_whole(shown: Array, behind: Array) -> float:
         The median; 0 if none is known.
     """
     whole = np.isfinite(shown) & (np.nan_to_num(behind) <= _BEHIND)
-    return finite_median(shown[whole] if whole.sum() >= _FEWEST_WHOLE else shown, 0.0)
+    return finite_median(shown[whole] if whole.sum() >= 12 else shown, 0.0)
 
 
 def together(observed: Observations, path: NDArray[np.int64], usual_px: float) -> NDArray[np.bool_]:
@@ -133,9 +115,8 @@ def together(observed: Observations, path: NDArray[np.int64], usual_px: float) -
         axis=1
     )
     other_px = finite_median(others[(path >= 0) & (others > 0)], np.inf)
-    most_px = np.clip(
-        usual_px + _OF_OTHER * other_px, _LEAST_TOGETHER * usual_px, _SHOWN[1] * usual_px
-    )
+    # where both touch, each hides a part of the other
+    most_px = np.clip(usual_px + 0.4 * other_px, 1.25 * usual_px, _SHOWN[1] * usual_px)
     return np.asarray((path >= 0) & (shown > most_px))
 
 
@@ -165,7 +146,7 @@ def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
     Returns:
         True if less than 0.7 is visible, or if part of it is hidden and its ends are uncertain.
     """
-    return np.asarray((in_view < MOSTLY) | ((in_view < WHOLE) & (doubt > _UNSURE)))
+    return np.asarray((in_view < MOSTLY) | ((in_view < WHOLE) & (doubt > 0.25)))
 
 
 def visible_share(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAMES) -> Array:
@@ -240,7 +221,7 @@ def disappears(shown: Array, behind: Array) -> bool:
     """Whether frames (k,) show an animal that disappears: fewer pixels, over the usual ones, and an
     outline that ends at a nearer object.
     """
-    return len(shown) > 0 and bool(shown.min() < _GOING and behind.max() > _BEHIND)
+    return len(shown) > 0 and bool(shown.min() < 0.8 and behind.max() > _BEHIND)
 
 
 class OcclusionMonitor:
@@ -251,7 +232,7 @@ class OcclusionMonitor:
 
     def __init__(self) -> None:
         # of measured frames: pixels, share of the outline behind something
-        self._shown: deque[tuple[float, float]] = deque(maxlen=_REMEMBERED)
+        self._shown: deque[tuple[float, float]] = deque(maxlen=900)
         # preceding frames with something in view: s, px, share behind
         self._near: deque[tuple[float, int, float]] = deque()
         self._lost = False
@@ -346,18 +327,12 @@ def elsewhere(
         both = np.hypot(observed.error_mm[rows, h], error_mm[rows])
         nearer = off < nearest[rows]
         nearest[rows[nearer]] = off[nearer]
-        allowed[rows[nearer]] = np.maximum(_TIMES_ERROR * both, _ELSEWHERE * length_mm)[nearer]
+        # in predicted errors, and over the length
+        allowed[rows[nearer]] = np.maximum(4.0 * both, 0.25 * length_mm)[nearer]
     return np.asarray(np.isfinite(nearest) & (nearest > allowed))
 
 
 # Plausibility of an animal's speed, given the clock of its recording.
-
-
-_OVER_S = 0.1  # interval over which the displacement exceeds single-frame noise
-_MOST_S = 0.2  # longest gap of missing frames
-_N_LOOKED_AT = 20_000  # frames, spread over the recording
-_FEWEST = 30
-_MOST_LENGTHS_S = 10.0  # for a quarter of the time; 1 to 4 are usual, in short bursts 30
 
 
 def why_too_fast(track: Track, length_mm: float) -> str:
@@ -369,16 +344,17 @@ def why_too_fast(track: Track, length_mm: float) -> str:
     """
     times_s = (track.times_ns - track.times_ns[0]) / 1e9
     n = len(times_s)
-    first = np.unique(np.linspace(0, n - 1, min(n, _N_LOOKED_AT)).round().astype(int))
-    then = np.searchsorted(times_s, times_s[first] + _OVER_S)
+    first = np.unique(np.linspace(0, n - 1, min(n, 20_000)).round().astype(int))
+    # the displacement in this time exceeds single-frame noise
+    then = np.searchsorted(times_s, times_s[first] + 0.1)
     first, then = first[then < n], then[then < n]
     passed_s = times_s[then] - times_s[first]
     gone = track.centroid_mm[then, :2] - track.centroid_mm[first, :2]
-    known = np.isfinite(gone).all(axis=1) & (passed_s <= _MOST_S)
-    if known.sum() < _FEWEST:
+    known = np.isfinite(gone).all(axis=1) & (passed_s <= 0.2)  # no long gap of missing frames
+    if known.sum() < 30:
         return ""
     speed = float(np.quantile(np.hypot(*gone[known].T) / passed_s[known], 0.75))
-    if speed <= _MOST_LENGTHS_S * length_mm:
+    if speed <= 10.0 * length_mm:  # 1 to 4 are usual, in short bursts 30
         return ""
     return (
         f"by its time stamps the animal goes {speed:,.0f} mm/s for a quarter of the time, "

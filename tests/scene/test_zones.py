@@ -110,37 +110,32 @@ def test_zones_relative_to_the_centre_turn_with_the_arena(tmp_path: Path) -> Non
     )
 
 
+CIRCLE = "circle = { centre = [0, 0], radius = 4 }"
 SLIPS = [
-    ("", "should contain only zones"),
-    ("[[zone]]\nname = 'a'", "should contain only zones"),
-    ("zones = 5", "should contain only zones"),
-    ("zones = [5]", "should be a table with a name"),
+    ("", "zones is missing"),
+    ("[[zone]]\nname = 'a'", "zone is an unknown key; the nearest known key is zones"),
+    ("zones = 5", "zones should be a valid list, got 5"),
+    ("zones = [5]", "zones 1 should be a table"),
     ("[[zones]\n", "should be a TOML file"),
-    ("[[zones]]\nname = 'a'", "either a circle or a polygon"),
-    ("[[zones]]\nnmae = 'a'", "the nearest known key is name"),
-    ("[[zones]]\nname = 'left half'\npolygon = []", "letters, digits"),
-    ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 1]]", "at least three corners"),
+    ("[[zones]]\nname = 'a'", "zones 1 should have either a circle or a polygon"),
+    (f"[[zones]]\nnmae = 'a'\n{CIRCLE}", "the nearest known key is name"),
+    (f"[[zones]]\nname = 'left half'\n{CIRCLE}", "letters, digits"),
+    ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 1]]", "zones 1 polygon List should have at"),
     ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 1], [2, 2]]", "enclose no area"),
+    ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [9, 9], [9, 0], [0, 8]]", "sides 1 and 3 cross"),
     (
-        "[[zones]]\nname = 'a'\npolygon = [[0, 0], [9, 9], [9, 0], [0, 8]]",
-        "sides 1 and 3 of the polygon cross",
-    ),
-    ("[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 'x'], [2, 2]]", "a pair of numbers"),
-    ("[[zones]]\nname = 'a'\ncircle = { centre = [0, 0], radius = 0 }", "positive number, got 0"),
-    ("[[zones]]\nname = 'a'\ncircle = { centre = [0, inf], radius = 4 }", "a pair of numbers"),
-    ("[[zones]]\nname = 'a'\ncircle = [0, 0, 4]", "a circle is written as"),
-    (
-        "[[zones]]\nname = 'a'\nunit = 'cm'\ncircle = { centre = [0, 0], radius = 4 }",
-        'unit = "mm" or "px"',
+        "[[zones]]\nname = 'a'\npolygon = [[0, 0], [1, 'x'], [2, 2]]",
+        "zones 1 polygon 2 2 should be a valid number, got 'x'",
     ),
     (
-        "[[zones]]\nname = 'a'\nunit = 'px'\ncircle = { centre = [-9e5, 0], radius = 4 }",
-        "above the horizon",
+        "[[zones]]\nname = 'a'\ncircle = { centre = [0, 0], radius = 0 }",
+        "zones 1 circle radius should be greater than 0, got 0",
     ),
-    (
-        2 * "[[zones]]\nname = 'a'\ncircle = { centre = [0, 0], radius = 4 }\n",
-        "two zones called 'a'",
-    ),
+    ("[[zones]]\nname = 'a'\ncircle = { centre = [0, inf], radius = 4 }", "a finite number"),
+    ("[[zones]]\nname = 'a'\ncircle = [0, 0, 4]", "zones 1 circle should be a table"),
+    (f"[[zones]]\nname = 'a'\nunit = 'cm'\n{CIRCLE}", "unit should be 'mm' or 'px'"),
+    (f"[[zones]]\nname = 'a'\nunit = 'px'\nrelative_to = 'centre'\n{CIRCLE}", "only with unit"),
+    (2 * f"[[zones]]\nname = 'a'\n{CIRCLE}\n", "two zones called 'a'"),
 ]
 
 
@@ -148,15 +143,18 @@ SLIPS = [
 def test_a_slip_is_told_in_one_sentence(tmp_path: Path, text: str, says: str) -> None:
     with pytest.raises(PlanError) as caught:
         zones(tmp_path, text)
-    assert says in str(caught.value)
+    assert says in str(caught.value), caught.value
     assert "zones.toml" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_no_centre_no_zones_about_it(tmp_path: Path) -> None:
-    text = '[[zones]]\nname = "a"\nrelative_to = "centre"\ncircle = { centre = [0, 0], radius = 4 }'
-    with pytest.raises(PlanError, match="no walls were found"):
+def test_no_centre_no_zones_about_it_and_none_above_the_horizon(tmp_path: Path) -> None:
+    text = f'[[zones]]\nname = "a"\nrelative_to = "centre"\n{CIRCLE}'
+    with pytest.raises(PlanError, match=r"'a' is relative to .* no walls were found"):
         zones(tmp_path, text, Arena("open"))
+    text = "[[zones]]\nname = 'a'\nunit = 'px'\ncircle = { centre = [-9e5, 0], radius = 4 }"
+    with pytest.raises(PlanError, match="'a' reaches above the horizon"):
+        zones(tmp_path, text)
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
