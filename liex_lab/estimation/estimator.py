@@ -28,8 +28,14 @@ from liex_lab.catalog import find_model
 from liex_lab.errors import EstimationError, ModelError
 from liex_lab.estimation import _cascade_kernels as kernels
 from liex_lab.estimation._residual_kernels import SphereModel
-from liex_lab.estimation.cascade import ImageSet, body_of
-from liex_lab.estimation.initial import N_DIRECTIONS, draw_starts, propose, start_poses
+from liex_lab.estimation.cascade import (
+    N_DIRECTIONS,
+    ImageSet,
+    body_of,
+    draw_starts,
+    propose,
+    start_poses,
+)
 from liex_lab.estimation.model import Model, check_model
 from liex_lab.estimation.refine import (
     SURE_SHARE,

@@ -25,15 +25,18 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation.cascade import Candidates, Cascade, TrainingSet, Truth
-from liex_lab.estimation.estimator import Detection, PoseEstimator
-from liex_lab.estimation.initial import (
+from liex_lab.estimation.cascade import (
     N_DIRECTIONS,
+    Candidates,
+    Cascade,
+    TrainingSet,
+    Truth,
     draw_starts,
     propose,
     start_poses,
     train_proposals,
 )
+from liex_lab.estimation.estimator import Detection, PoseEstimator
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.estimation.refine import (

@@ -43,22 +43,20 @@ from liex_lab.tracking.track import (
     spans,
     whole_gaps,
 )
-from liex_lab.tracking.track_rows import (
-    SIGHT,
-    doubted,
-    hide,
-    mask_and_flag,
-    to_track,
-    write_curve,
-)
 from liex_lab.tracking.trust import (
+    SIGHT,
     OcclusionMonitor,
     distances,
+    doubted,
     elsewhere,
     gone_behind,
+    hide,
     lies_unknown,
+    mask_and_flag,
     share_in_view,
+    to_track,
     usual_pixels,
+    write_curve,
 )
 
 Mask = NDArray[np.bool_]

@@ -29,9 +29,15 @@ from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.height_maps import HeightMaps, Patches, Segmenter
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.occlusion import OcclusionCorrection, behind_something
 from liex_lab.tracking.own_shape import OwnShape, StatedShape, fit_shape
-from liex_lab.tracking.residual import BodyAgreement, BodyResidual, SampleFit, count_animals
+from liex_lab.tracking.residual import (
+    BodyAgreement,
+    BodyResidual,
+    OcclusionCorrection,
+    SampleFit,
+    behind_something,
+    count_animals,
+)
 from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Flip, Subject, Tracked
 from liex_lab.tracking.trust import WHOLE, finite_median, median_of_whole, visible_share

@@ -40,9 +40,8 @@ from numpy.typing import NDArray
 from liex_lab.baselines.baseline import Baseline
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, MissingPackageError
-from liex_lab.estimation.cascade import Candidates, ImageSet
+from liex_lab.estimation.cascade import Candidates, ImageSet, draw_starts, start_poses
 from liex_lab.estimation.estimator import PoseEstimator
-from liex_lab.estimation.initial import draw_starts, start_poses
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording

@@ -45,8 +45,8 @@ from liex_lab.tracking.curve import OnlineTracker
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.particles import SEARCHED, ParticleFilter, ProcessNoise
 from liex_lab.tracking.track import Track
-from liex_lab.tracking.track_rows import single_frames
 from liex_lab.tracking.tracker import FrameTracker
+from liex_lab.tracking.trust import single_frames
 
 from ..build import build_scene, plan_of
 from ..training.pose_model import estimator_of

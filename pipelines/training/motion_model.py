@@ -37,8 +37,8 @@ from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.smoother import TrackingParameters, tunings_with
 from liex_lab.tracking.track import Subject, Track
-from liex_lab.tracking.track_rows import stretch_of
 from liex_lab.tracking.tracker import FrameTracker
+from liex_lab.tracking.trust import stretch_of
 
 from ..build import build_scene, plan_of
 from .pose_model import estimator_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body.skeleton import CameraView, Skeleton
-from liex_lab.estimation.initial import draw_starts, start_poses
+from liex_lab.estimation.cascade import draw_starts, start_poses
 from liex_lab.estimation.method import method_of
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording

@@ -7,7 +7,7 @@ from liex_lab.scene.height_maps import CROP, HeightMaps
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.curve import OnlineTracker, track_whole
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.occlusion import behind_something
+from liex_lab.tracking.residual import behind_something
 from liex_lab.tracking.track import Track
 from tests.tracking.stories import SUBJECT, lose, noisy, told, walk
 

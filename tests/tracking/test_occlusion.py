@@ -13,7 +13,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.tracking.observations import reversed_pose
-from liex_lab.tracking.occlusion import OcclusionCorrection
+from liex_lab.tracking.residual import OcclusionCorrection
 
 FISH = Skeleton.load("fish")
 CAMERA = Camera(900.0, 900.0, 159.5, 119.5, 320, 240)

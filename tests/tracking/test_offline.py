@@ -17,7 +17,7 @@ from liex_lab.tracking.curve import OnlineTracker, track_whole
 from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
 from liex_lab.tracking.smoother import SmoothedCurve
 from liex_lab.tracking.track import Flip, Track, ends_of, short_gaps, spans, whole_gaps
-from liex_lab.tracking.track_rows import covariance_of_root, single_frames
+from liex_lab.tracking.trust import covariance_of_root, single_frames
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
 
 SECONDS = np.delete(np.arange(150) / 30, [40, 41, 90])  # a camera that missed three frames

@@ -12,8 +12,8 @@ from liex_lab.recordings.frame import DepthFrame
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.tracking.own_shape import StatedShape
 from liex_lab.tracking.track import Track
-from liex_lab.tracking.track_rows import single_frames
 from liex_lab.tracking.tracker import FrameTracker
+from liex_lab.tracking.trust import single_frames
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, rendered, toy_mice, trained
 
 HOME_MM = 52.8341

@@ -25,9 +25,8 @@ from liex_lab.baselines.baseline import (
 )
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import PlanError
-from liex_lab.estimation.cascade import Candidates, Cascade, TrainingSet
+from liex_lab.estimation.cascade import N_DIRECTIONS, Candidates, Cascade, TrainingSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
-from liex_lab.estimation.initial import N_DIRECTIONS
 from liex_lab.estimation.method import Method, method_of
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.training import (
