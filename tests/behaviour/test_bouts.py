@@ -48,16 +48,6 @@ def test_speed_names_the_stretch(speed, word):
     assert bouts["net_turn_rad"].iloc[0] == pytest.approx(speed / 400.0 * 59 / 30, rel=1e-3)
 
 
-def test_bouts_are_half_open_ordered_and_do_not_overlap():
-    mouse = WalkingMouse(
-        np.delete(steady(6.0), slice(100, 104)), rear_s=(1.0, 2.0), lost=(120, 121)
-    )
-    bouts = bouts_of(mouse)
-    assert (bouts["stop_s"].to_numpy()[:-1] <= bouts["start_s"].to_numpy()[1:] + 1e-9).all()
-    assert (bouts["stop_frame"].to_numpy()[:-1] <= bouts["start_frame"].to_numpy()[1:]).all()
-    assert (bouts["stop_s"] > bouts["start_s"]).all()
-
-
 def test_a_bout_ends_at_a_gap_one_step_after_its_last_frame():
     bouts = bouts_of(WalkingMouse(np.delete(steady(2.0), slice(30, 40))))
     assert list(bouts["action"]) == ["walk", "walk"]

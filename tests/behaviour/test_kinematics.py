@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from liex_lab.behaviour.body import STANDS, SWIMS, BodyAxis
-from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments, smallest_turn
+from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments
 from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.runtime.memory import on_disk, rest
 from liex_lab.tables import schema
@@ -37,7 +37,7 @@ def test_an_animal_on_a_circle_has_the_speed_and_the_turn_it_walks_with():
     assert moved["step_mm"].sum() == pytest.approx(800.0, rel=1e-3)
 
 
-@pytest.mark.parametrize("fps", [10.0, 25.0, 30.0, 60.0, 200.0])
+@pytest.mark.parametrize("fps", [10.0, 200.0])
 def test_the_speed_does_not_depend_on_the_frame_rate(fps):
     moved = kinematics(
         *tables_of(WalkingMouse(steady(3.0, fps), speed_mm_s=150.0, radius_mm=300.0))
@@ -122,11 +122,6 @@ def test_a_jump_that_no_animal_makes_is_left_empty():
     poses.loc[poses["frame_index"] >= 15, "x_mm"] += 400.0
     moved = kinematics(frames, poses)
     assert list(np.flatnonzero(moved["speed_mm_s"].isna())) == [14, 15]
-
-
-def test_the_turn_is_the_short_way_round():
-    turns = smallest_turn(np.array([3.5, -3.5, 0.1, np.pi]))
-    np.testing.assert_allclose(turns, [3.5 - 2 * np.pi, 2 * np.pi - 3.5, 0.1, np.pi])
 
 
 def test_neighbours_agree_with_the_search_a_reader_would_write():

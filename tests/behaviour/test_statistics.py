@@ -223,16 +223,6 @@ def test_each_number_of_units_stands_beside_its_own_group():
     assert only(table)["contrast"] == "drug - vehicle", "a control group is the reference"
 
 
-@pytest.mark.parametrize(
-    "values", [[1.0] * 10, [0.0] * 10, [np.nan] * 10, [0.0] * 5 + [np.nan] * 5]
-)
-def test_a_difference_of_nothing_is_no_result(values):
-    row = only(study(5, values=values))
-    assert np.isnan(row["estimate"])
-    assert np.isnan(row["ci_low"])
-    assert result(row, "").startswith("No test of speed, b - a: ")
-
-
 def test_names_that_differ_in_capitals_or_spaces_are_one_and_this_is_told():
     table = study(5)
     spelled = table.assign(group=["a", "A", "a ", "a", "a", "b-1", "b 1", "b_1", "B1", "b 1"])

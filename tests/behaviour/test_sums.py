@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from typing import Any
 
 import numpy as np
@@ -169,12 +168,6 @@ def test_what_follows_by_chance_is_rarely_called_significant_and_a_habit_is():
     assert pair["probability"] > 0.9 > 2 * pair["by_chance"]
 
 
-def test_two_actions_leave_no_choice_and_no_test():
-    table = transitions(ethogram(["walk", "rear"] * 20), ("walk", "rear"), NO_GAPS, 0.33)
-    assert table["p"].isna().all()
-    assert list(table["n"]) == [20, 19]
-
-
 def test_false_discovery_agrees_with_the_rule_as_it_is_printed():
     rng = np.random.default_rng(2)
     p = rng.random(30) ** 2
@@ -321,18 +314,6 @@ def test_named_and_unlabelled_time_is_the_observed_time_whatever_was_lost(case):
         assert sum(row[f"{word}_share"] for word in slow) == pytest.approx(1.0)
 
 
-@pytest.mark.nightly
-def test_an_hour_is_measured_in_a_few_seconds():
-    frames, poses = tables_of(
-        WalkingMouse(steady(3600.0), rear_s=(1000.0, 1500.0), speed_mm_s=90.0)
-    )
-    began = time.process_time()
-    behaviour = measure(frames, poses)
-    assert time.process_time() - began < 20.0
-    assert len(behaviour.kinematics) == 108_000
-    assert behaviour.activity["distance_mm"].sum() == pytest.approx(324_000, rel=1e-3)
-
-
 def test_the_tables_can_be_made_again_from_the_session_s_folder_alone(tmp_path):
     nest = Zone("nest", polygon_mm=((0.0, 0.0), (200.0, 0.0), (200.0, 200.0), (0.0, 200.0)))
     mouse = WalkingMouse(steady(5.0), rear_s=(1.0, 2.2), lost=(90, 91))
@@ -411,14 +392,6 @@ def test_a_place_outside_of_the_rectangle_widens_it():
     found = occupancy([[500.0, 0.0]], [2.0], [-100.0, -100.0], [100.0, 100.0])
     assert found.observed_s == pytest.approx(2.0)
     assert found.x_mm[-1] >= 500.0
-
-
-def test_where_it_sat_is_the_fullest_cell():
-    xy = np.array([[10.0, -40.0]] * 50 + [[-60.0, 60.0]] * 5)
-    found = occupancy(xy, np.full(55, 0.1), [-100.0, -100.0], [100.0, 100.0])
-    row, column = np.unravel_index(found.time_s.argmax(), found.time_s.shape)
-    assert found.x_mm[column] <= 10.0 + 5.0 <= found.x_mm[column + 1] + 5.0
-    assert found.y_mm[row] - 5.0 <= -40.0 <= found.y_mm[row + 1] + 5.0
 
 
 def test_nobody_seen_is_no_time_and_no_error():

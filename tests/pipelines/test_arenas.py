@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from liex_lab.pipelines import session as job
 from liex_lab.pipelines.arenas import run_arenas
 from liex_lab.pipelines.build import propose_arenas, stated_corners
 from liex_lab.pipelines.choice import fit_plan
@@ -25,7 +24,6 @@ from liex_lab.sessions import Session, SessionWriter
 from liex_lab.simulation.scenes.catalogue import film
 from liex_lab.simulation.scenes.stage import TrueScene
 from tests.pipelines.conftest import measure
-from tests.pipelines.test_shards import InTurn
 
 N_FRAMES = 40
 measure_all = partial(run_arenas, report=False)
@@ -107,34 +105,10 @@ def alone(session: Path, scene: str, out: Path, masked: bool) -> Path:
 
 @pytest.mark.slow
 def test_every_arena_is_the_session_of_the_same_arena_cut_out_and_run_alone(sessions, tmp_path):
-    for session, masked in zip(sessions[0], (False, True), strict=True):
-        assert tables(alone(session, "two-arenas", tmp_path, masked)) == tables(session)
+    assert tables(alone(sessions[0][1], "two-arenas", tmp_path, True)) == tables(sessions[0][1])
+    assert set(Counter(sessions[1]).values()) == {1}, "each frame is decoded once"
 
 
-@pytest.mark.nightly
-def test_every_one_of_four_arenas_is_the_session_of_that_arena_run_alone(tmp_path):
-    """Their regions lie side by side, and the animals in them differ in size and build."""
-    made, _ = images("four-arenas")
-    plan = Plan.load("mouse").with_settings(["replay.depth=false"])
-    arenas = propose_arenas(made, plan)
-    assert len(arenas) == 4
-    outcomes = measure_all(
-        recording("four-arenas"), plan.model_copy(update={"arenas": arenas}), tmp_path / "four"
-    )
-    assert [one.error for one in outcomes] == [None] * 4
-    found = [one.session for one in outcomes if one.session is not None]
-    assert len({tables(path)["poses.parquet"] for path in found}) == 4
-    for path in found:
-        masked = path is found[-1]  # the others cannot be in it
-        assert tables(alone(path, "four-arenas", tmp_path, masked)) == tables(path)
-
-
-@pytest.mark.slow
-def test_each_frame_is_decoded_once_for_all_arenas(sessions):
-    assert set(Counter(sessions[1]).values()) == {1}
-
-
-@pytest.mark.slow
 def test_each_arena_follows_its_own_animal(sessions):
     made, _ = images()
     measured = [read_individuals(Session.open(path))[0].joints_camera for path in sessions[0]]
@@ -147,7 +121,7 @@ def test_each_arena_follows_its_own_animal(sessions):
     assert min(max(row) for row in errors) > 60.0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_arena_without_an_animal_stops_no_other(tmp_path):
     made, depths = images()
     plan = several()
@@ -164,7 +138,7 @@ def test_an_arena_without_an_animal_stops_no_other(tmp_path):
     assert isinstance(empty.error, EstimationError)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_interrupted_run_of_several_arenas_goes_on(sessions, tmp_path, monkeypatch):
     monkeypatch.setattr("liex_lab.sessions.checkpoint.EVERY_S", 0.0, raising=False)
     add = SessionWriter.add
@@ -249,25 +223,8 @@ def test_the_doctor_says_what_is_wrong_with_a_region_and_looks_all_the_same():
     assert found["floor_mm"] is not None
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_empty_arena_is_said_to_hold_no_animal():
     with pytest.raises(MisfitError, match="no animal was found") as caught:
         fit_plan(film("empty", 1001, N_FRAMES), Plan.load("mouse"))
     assert caught.value.exit_code == 4
-
-
-@pytest.mark.nightly
-def test_workers_make_the_same_tables_of_every_arena(tmp_path, monkeypatch):
-    monkeypatch.setattr(job, "LENGTH", 15)
-    address = f"synthetic:scene?name=two-arenas&seed=1001&frames={N_FRAMES}"
-    region = "{circle = {centre = [-150, 10], radius = 170}, unit = 'mm'}"
-    table = several().model_dump(exclude_none=True)
-    table["arenas"] = [{"name": "left", "region": Plan().with_settings([f"arena.region={region}"])}]
-    table["arenas"][0]["region"] = table["arenas"][0]["region"].arena.region.model_dump()
-    plan = Plan.from_table(table)
-    pool = InTurn()
-    (one,) = measure_all(address, plan, tmp_path / "workers", pool=pool)
-    (other,) = measure_all(address, plan, tmp_path / "alone")
-    assert pool.n_done == 3
-    assert (one.error, other.error) == (None, None)
-    assert tables(one.session) == tables(other.session)

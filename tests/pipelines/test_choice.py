@@ -215,6 +215,7 @@ def test_an_animal_that_is_shorter_than_the_other_is_counted_and_a_thing_is_not(
     assert count_animals(agreement(96, 0.8), thing, rows, 96) == 1
 
 
+@pytest.mark.nightly
 def test_a_slim_mouse_beside_a_stout_one_of_its_length_is_counted() -> None:
     """The girth of the one that is measured says nothing of the other's."""
     recording = film("two-animals", 1003, 60, family="other")
@@ -249,8 +250,3 @@ def test_an_own_animal_has_its_name_and_its_limits_from_its_skeleton(
     )
     with pytest.raises(MisfitError, match=f"does not fit the plan of the {name}"):
         fit_plan(RECORDING, plan)
-
-
-@pytest.mark.parametrize("name", ["mouse", "fish", "hand"])
-def test_the_animal_of_a_bundled_plan_is_what_the_plan_says(name: str) -> None:
-    assert animal_of(Plan.load(name)) == Plan.load(name).animal

@@ -109,6 +109,7 @@ def test_on_one_core_the_run_compiles_what_it_calls(
     assert not asked
 
 
+@pytest.mark.nightly
 def test_processes_compile_what_is_installed_wherever_they_are_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -54,8 +54,7 @@ def listing(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
 
 
-@pytest.mark.parametrize("source", SOURCES)
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize(("source", "target"), zip(SOURCES, TARGETS * 2, strict=True))
 def test_a_recording_is_the_same_in_every_format(tmp_path: Path, source: str, target: str) -> None:
     path = SOURCES[source](tmp_path)
     told: list[tuple[int, int | None, str]] = []
@@ -81,20 +80,6 @@ def test_an_mcap_file_may_hold_the_messages_of_ros(tmp_path: Path) -> None:
     write_times(source, even_times(12, start_ns=3_000_000_000 * 10**9))
     with pytest.raises(RecordingError, match="end in 2038"):
         convert(source, tmp_path / "c.mcap", ros=True)
-
-
-def test_there_and_back_again_is_what_it_was(tmp_path: Path) -> None:
-    source = write_png_folder(tmp_path / "a", STORED, subject_id="m01")
-    convert(source, tmp_path / "b.mcap")
-    convert(tmp_path / "b.mcap", tmp_path / "c")
-    convert(tmp_path / "c", tmp_path / "d.mcap")
-    convert(tmp_path / "b.mcap", tmp_path / "e.mcap")
-    with open_recording(tmp_path / "a") as first, open_recording(tmp_path / "d.mcap") as last:
-        np.testing.assert_array_equal([f.depth for f in first], [f.depth for f in last])
-        assert first.times_ns.tolist() == last.times_ns.tolist()
-        assert (first.camera, first.metadata) == (last.camera, last.metadata)
-    with open_recording(tmp_path / "e.mcap") as again:
-        assert again.camera.source == "camera.toml", "where the numbers came from first"
 
 
 def test_a_virtual_recording_and_one_that_is_open_can_be_written(tmp_path: Path) -> None:
@@ -224,9 +209,8 @@ def test_nothing_half_written_stays_behind(
     assert listing(tmp_path) == ["r.mcap"]
 
 
-@pytest.mark.parametrize(
-    "target", [TARGETS[0], pytest.param(TARGETS[1], marks=pytest.mark.nightly)]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("target", TARGETS)
 def test_a_full_disk_is_a_sentence_and_leaves_nothing(tmp_path: Path, target: str) -> None:
     source = write_mcap(tmp_path / "r.mcap", depth_frames(12, 320, 240), PRIMESENSE_QVGA)
 
@@ -298,13 +282,8 @@ def test_an_archive_holds_every_picture_time_and_fact_bit_for_bit(walking: Path)
         assert other.metadata["subject_id"] == "m07"
         assert other.metadata["packed"]["source"]["sha256"] == one.digest()
     assert done.path.stat().st_size < 0.85 * done.source_bytes
-
-
-def test_an_archive_is_known_by_its_content_under_any_name(walking: Path) -> None:
-    done = pack(walking, plan=PLAN, whole=True)
-    other = done.path.rename(walking.with_name("archive of tuesday.bin"))
-    with open_recording(other) as opened:
-        assert len(opened) == len(MOUSE.times_s)
+    with open_recording(done.path.rename(walking.with_name("of tuesday.bin"))) as renamed:
+        assert len(renamed) == len(MOUSE.times_s), "an archive is known by its content"
 
 
 def test_outside_of_a_region_that_was_named_pixels_are_unread(walking: Path) -> None:
@@ -362,15 +341,6 @@ def test_a_cut_archive_is_refused_and_its_whole_frames_can_be_read(walking: Path
     accepting = PLAN.with_settings(["recording.accept_truncated=true"])
     with pytest.raises(RecordingError, match="have another hash than it states"):
         pack(done.path, plan=accepting, verify=True)
-
-
-def test_a_changed_byte_is_found_on_opening(walking: Path) -> None:
-    done = pack(walking, plan=PLAN, whole=True)
-    data = bytearray(done.path.read_bytes())
-    data[len(data) // 2] ^= 0x10
-    done.path.write_bytes(data)
-    with pytest.raises(RecordingError, match="damaged"):
-        pack(done.path, plan=PLAN, verify=True)
 
 
 def test_a_picture_that_was_exchanged_is_found_by_the_hash(walking: Path) -> None:

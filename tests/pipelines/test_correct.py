@@ -140,7 +140,7 @@ def test_a_joint_under_a_pixel_lies_as_deep_under_the_skin_as_it_usually_does(
     )  # the pixels are 7 mm wide
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from([0, 60, 75, 90, 104]), st.integers(-8, 8), st.integers(-8, 8))
 def test_a_joint_put_off_the_animal_keeps_its_height_and_none_is_put_below_the_floor(
     measured: Session, row: int, du: int, dv: int
@@ -161,48 +161,19 @@ def test_a_joint_put_off_the_animal_keeps_its_height_and_none_is_put_below_the_f
     np.testing.assert_allclose(under, uv, atol=1e-3)
 
 
-def test_beside_a_rearing_mouse_neither_the_joint_nor_its_neighbours_fall(session: Session) -> None:
-    row = 80
-    height = session.poses["z_mm"].to_numpy(float).reshape(-1, 5)[:, 4]
-    nose = session.poses.iloc[5 * row + 4]
-    move = correcting.joint_move_at_pixel(session, row, "nose", nose["u_px"] - 4, nose["v_px"] + 5)
-    assert move.note, "the floor is seen there"
-    now = corrected(session, move).poses["z_mm"].to_numpy(float).reshape(-1, 5)[:, 4]
-    np.testing.assert_allclose(now[row - 3 : row + 4], height[row - 3 : row + 4], atol=3.0)
-
-
-def test_a_wall_an_unread_pixel_and_a_frame_without_depth_say_nothing_of_a_height(
-    session: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    row = 80
-    nose = session.poses.iloc[5 * row + 4]
-    real = correcting.depth_under
-    for pictures in (
-        lambda depth, u, v: real(np.minimum(depth, FLOOR_MM - 150.0), u, v),  # it stands there
-        lambda depth, u, v: float("nan"),
-    ):
-        monkeypatch.setattr(correcting, "depth_under", pictures)
-        move = correcting.joint_move_at_pixel(session, row, "nose", nose["u_px"], nose["v_px"])
-        assert move.note
-        assert move.z_mm == pytest.approx(nose["z_mm"], abs=1e-3)
-
-
-@pytest.mark.parametrize("height_mm", [2.0, 5.0])
 def test_frames_around_a_joint_that_is_put_on_the_floor_stay_above_it(
-    session: Session, height_mm: float
+    session: Session,
 ) -> None:
-    for row in (61, 75, 103):  # the nose goes up, is up, and goes down
-        x, y = session.poses.iloc[5 * row + 4][["x_mm", "y_mm"]]
-        found = corrected(session, correcting.joint_move(session, row, "nose", (x, y, height_mm)))
-        z = found.poses["z_mm"].to_numpy(float).reshape(-1, 5)
-        assert np.nanmin(np.delete(z, row, axis=0)) >= 0.0
-        assert z[row].min() > -1.0  # bones keep their lengths
-        session = corrected(found, undo=[found.log.standing[0].number])
+    x, y = session.poses.iloc[5 * 75 + 4][["x_mm", "y_mm"]]
+    found = corrected(session, correcting.joint_move(session, 75, "nose", (x, y, 2.0)))
+    z = found.poses["z_mm"].to_numpy(float).reshape(-1, 5)
+    assert np.nanmin(np.delete(z, 75, axis=0)) >= 0.0
+    assert z[75].min() > -1.0  # bones keep their lengths
     with pytest.raises(SessionError, match=r"below the floor; give a height z of 0 mm or more"):
         correcting.joint_move(session, 75, "nose", (x, y, -2.0))
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(st.lists(st.sampled_from(["new", "undo", "redo"]), max_size=14))
 def test_redo_makes_again_what_was_taken_back_until_something_new_is_done(steps: list[str]) -> None:
     log, done, undone = Log("m"), [], []  # type: tuple[Log, list[object], list[object]]
@@ -395,6 +366,10 @@ MISTAKES: dict[str, tuple[Callable[[Session], object], str]] = {
         lambda s: correcting.flip_span(s, 50, 60),
         "a span to flip is from a time to a later one",
     ),
+    "no pose to exchange": (
+        lambda s: correcting.flip_span(s, 0.66, 0.72),
+        "has a pose, so there is nothing to exchange",
+    ),
     "nothing to do again": (
         lambda s: correct_session(s.path, report=False),
         "has no corrections to apply",
@@ -439,7 +414,11 @@ def test_what_cannot_be_is_refused_with_a_sentence(measured: Session, mistake: s
     assert not (measured.path / "corrected").exists()
 
 
-def test_the_command_line_corrects_lists_and_takes_back(session: Session) -> None:
+def test_the_command_line_corrects_lists_and_takes_back(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("liex_lab.pipelines.correct.write_views", lambda _: None)
+
     def liex(*words: object) -> str:
         ran = CliRunner().invoke(cli.app, ["correct", *map(str, words)], env={"COLUMNS": "200"})
         if ran.exception and not isinstance(ran.exception, SystemExit):
@@ -467,6 +446,7 @@ def test_the_command_line_corrects_lists_and_takes_back(session: Session) -> Non
     assert "run" in set(Session.open(place).bouts["action"])
     assert "again:     stroll" in liex("redo", place)
     assert ("stroll", 1.0, 2.0, "human") in spans(Session.open(place))
+    monkeypatch.undo()
     liex("apply", place)
     assert "corrections were made by hand by ada" in (place / "report.html").read_text(
         encoding="utf-8"
@@ -503,26 +483,6 @@ def test_who_the_animal_is_can_be_said_afterwards_and_taken_back(session: Sessio
     assert again.table("sessions")["group"].iloc[0] == ""
     back = corrected(again, undo=[3])
     assert back.metadata["subject"]["group"] == "drug"
-
-
-def test_age_and_species_are_described_as_archives_want_them(session: Session) -> None:
-    told = corrected(
-        session, *correcting.descriptions({"age": "12 weeks", "species": "Rattus norvegicus"})
-    )
-    assert told.metadata["subject"]["age"] == "P12W"
-    assert told.metadata["subject"]["species"] == "Rattus norvegicus"
-    again = corrected(told, *correcting.descriptions({"species": ""}))
-    assert "species" not in again.metadata["subject"]
-
-
-def test_descriptions_stand_beside_corrections(session: Session) -> None:
-    moment = "2026-08-21T10:00:00+02:00"
-    one = corrected(session, correcting.rename_bout(session, 2.5, "run"))
-    two = corrected(one, *correcting.descriptions({"cage": "c1", "session_start_time": moment}))
-    assert two.metadata["corrections"]["n"] == 1
-    assert two.metadata["session_start_time"] == moment
-    assert two.table("sessions")["cage"].iloc[0] == "c1"
-    assert ("run", "human") in set(zip(two.bouts["action"], two.bouts["source"], strict=True))
 
 
 @pytest.mark.parametrize(
@@ -571,13 +531,6 @@ def along(session: Session) -> np.ndarray:
     return poses.loc["nose"].to_numpy() - poses.loc["rump"].to_numpy()
 
 
-def test_the_span_points_the_other_way_and_what_lies_far_from_it_stays(tracked, flipped):
-    agree = np.sum(along(tracked) * along(flipped), axis=1)
-    assert (agree[SPAN.start + 1 : SPAN.stop - 1] < 0).all()
-    assert (agree[: SPAN.start - 3] > 0).all()
-    assert (agree[SPAN.stop + 3 :] > 0).all()
-
-
 def test_every_table_follows(tracked, flipped):
     middle = SPAN.start + 4
     turned = flipped.kinematics["heading_rad"][middle] - tracked.kinematics["heading_rad"][middle]
@@ -608,6 +561,7 @@ def test_nothing_is_measured_across_the_ends_of_an_exchange(tracked, flipped):
     pd.testing.assert_frame_equal(again.kinematics, flipped.kinematics)
 
 
+@pytest.mark.nightly
 def test_an_exchange_that_disagrees_names_its_half_turns_and_the_command_that_agrees(
     flipped, tmp_path
 ):
@@ -639,23 +593,6 @@ def test_a_joint_placed_before_its_frame_was_exchanged_is_of_the_other_end(track
     assert np.linalg.norm(found.joints_mm[row, 0] - nose) < 1.5, "its rump is there now"
     later = corrected_track(tracked, Log("", tuple(entries[::-1])), skeleton)
     assert np.linalg.norm(later.track.joints_mm[row, -1] - nose) < 20.0, "what was said last holds"
-
-
-def test_frames_without_a_pose_cannot_be_exchanged(tracked, monkeypatch):
-    monkeypatch.setattr(correcting, "_ahead", lambda session: np.full((30, 3), np.nan))
-    with pytest.raises(SessionError, match="has a pose, so there is nothing to exchange"):
-        flip_span(tracked, FROM_S, TO_S)
-
-
-def test_what_was_measured_is_as_it_was_and_the_correction_can_be_taken_back(
-    tracked, flipped, tmp_path
-):
-    folder = Path(shutil.copytree(flipped.path, tmp_path / flipped.path.name))
-    pd.testing.assert_frame_equal(Session.open(folder, raw=True).poses, tracked.poses)
-    assert (folder / "poses.parquet").read_bytes() == (tracked.path / "poses.parquet").read_bytes()
-    again = Session.open(correct_session(folder, undo=[1], report=False))
-    pd.testing.assert_frame_equal(again.poses, tracked.poses)
-    pd.testing.assert_frame_equal(again.bouts, tracked.bouts)
 
 
 def test_a_session_without_what_its_frames_said_tells_what_to_do(tracked, tmp_path):

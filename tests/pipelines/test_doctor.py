@@ -373,6 +373,7 @@ def test_water_is_told_and_undone(tmp_path: Path) -> None:
     assert "the floor is not below it" in problems(path, "water.height_mm=700")
 
 
+@pytest.mark.nightly
 def test_a_camera_tilted_against_the_water_is_told_how_to_say_so(tmp_path: Path) -> None:
     """A level tank under a tilted camera: the floor comes out tilted against the surface until the
     plan says it.
@@ -511,6 +512,7 @@ def test_every_camera_that_a_plan_may_name_is_there_and_sees_as_wide_as_it_shoul
             found = preset(name, camera.width, camera.height)
             assert replace(found, source=camera.source) == camera
             assert name in of_size(camera.width, camera.height)
+            assert unusual_centre(camera) == ("", False)
             view = np.degrees(2 * np.arctan(camera.width / 2 / camera.fx))
             assert 20 < view < 95
             corner = camera.unproject([0.0, 0.0], 1000.0)
@@ -614,6 +616,7 @@ DEPTH = (
 )
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", DEPTH)
 def test_every_genuine_file_that_holds_depth_gets_a_diagnosis(
     reference_data: Path, name: str
@@ -641,9 +644,3 @@ def test_a_principal_point_far_from_the_middle_is_reported(
 ) -> None:
     sentence, edge = unusual_centre(Camera(287.9, 287.9, cx, cy, 320, 240))
     assert (f"({cx:.1f}, {cy:.1f})" in sentence, edge) == (said, at_edge)
-
-
-def test_every_known_camera_looks_through_its_middle() -> None:
-    for cameras in PRESETS.values():
-        for camera in cameras:
-            assert unusual_centre(camera) == ("", False)

@@ -32,7 +32,7 @@ from tests.sessions.walking_mouse import WalkingMouse, steady, write
 MOUSE = WalkingMouse(steady(0.5))
 # `python -m tests.campaign names` has every writer meet all of them
 _THOROUGH = "LIEX_ALL_NAMES" in os.environ
-_SOME = NAMES if _THOROUGH else NAMES[::22]
+_SOME = NAMES if _THOROUGH else NAMES[::44]
 _OPENED = [name for name in NAMES if name != "nul\0byte" and "\ud800" not in name]
 
 
@@ -91,7 +91,7 @@ def renamed(measured: Session, to: Path, **facts: Any) -> Session:
     return Session.open(to)
 
 
-@pytest.mark.parametrize("name", NAMES if _THOROUGH else NAMES[::4])
+@pytest.mark.parametrize("name", NAMES if _THOROUGH else NAMES[::12])
 def test_exports_stay_in_their_folder(name: str, measured: Session, root: Path) -> None:
     out = root / "a" / "b" / "out"
     facts = {"session_id": name, "individual": name}

@@ -6,15 +6,14 @@ import time
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.evaluation.speed import evaluate_live, to_and_fro
+from liex_lab.pipelines.evaluation.speed import evaluate_live
 from liex_lab.pipelines.live import open_live, track_live
 
 from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.streaming import Arrival, _stamped, growing, received, replayed
+from liex_lab.recordings.streaming import growing, received, replayed
 
 ADDRESS = "synthetic:walk?seed=3&frames=24&sensor=primesense-qvga&spine_mm=70"
 PLAN = Plan.load("mouse").with_settings(["animal.spine_mm=70"])
@@ -127,15 +126,6 @@ def test_a_first_frame_that_is_long_in_the_making_ends_nothing(monkeypatch):
     came = list(replayed(slow, speed=4.0).frames)
     assert [arrival.frame.index for arrival in came] == list(range(5))
     assert came[-1].at_s - came[0].at_s > 0.8 * slow.duration_s / 4.0, "nor is its pace lost"
-
-
-def test_frames_go_to_and_fro_and_keep_the_time_when_they_came():
-    frames = [
-        Arrival(DepthFrame(k, k, np.zeros((2, 2), np.float32)), at)
-        for k, at in enumerate((0.0, 0.1, 0.2))
-    ]
-    assert to_and_fro(3, 8).tolist() == [0, 1, 2, 1, 0, 1, 2, 1]
-    assert [arrival.at_s for arrival in _stamped(iter(frames))] == [0.0, 0.1, 0.2]
 
 
 @pytest.mark.nightly  # at the pace of the cameras

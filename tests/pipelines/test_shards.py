@@ -14,10 +14,9 @@ from liex_lab.pipelines.build import build_provenance, build_recording, build_tr
 from liex_lab.pipelines.verify import verify_session
 
 from liex_lab.api import run_session
-from liex_lab.errors import RecordingError, SessionError
+from liex_lab.errors import SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings.formats import moseq
-from liex_lab.recordings.recording import Recording
 from liex_lab.runtime import processes
 from liex_lab.runtime.processes import Processes
 from liex_lab.sessions import Session
@@ -57,6 +56,7 @@ def run(folder: Path, out: Path, pool: Any = None) -> Path:
     return measure(folder, Plan.load("mouse"), out, pool=pool)
 
 
+@pytest.mark.nightly
 def test_processes_make_the_same_session(walked: Session, walk: Path, tmp_path: Path) -> None:
     shared = run_session(walk, Plan.load("mouse"), tmp_path, pool=Processes(2))
     assert tables_of(shared) == tables_of(walked.path)
@@ -68,7 +68,7 @@ def test_processes_make_the_same_session(walked: Session, walk: Path, tmp_path: 
     assert not [one.sentence for one in verify_session(shared) if one.state == "wrong"]
 
 
-@pytest.mark.parametrize("pooled", [True, False])
+@pytest.mark.parametrize("pooled", [True, pytest.param(False, marks=pytest.mark.nightly)])
 def test_complete_shards_are_kept_after_an_error(
     pooled: bool, walked: Session, walk: Path, tmp_path: Path
 ) -> None:
@@ -83,34 +83,7 @@ def test_complete_shards_are_kept_after_an_error(
     assert not list(tmp_path.glob("*.part"))
 
 
-def test_a_frame_that_cannot_be_read_ends_the_run_with_its_number(
-    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frame, measure_shard = Recording.frame, job.measure_shard
-
-    def torn(self: Recording, row: int) -> Any:
-        if row == 21:
-            raise RecordingError("frame 21 cannot be read; copy the recording again")
-        return frame(self, row)
-
-    def torn_shard(work: Any) -> Any:
-        with monkeypatch.context() as patch:
-            patch.setattr(Recording, "frame", torn)
-            return measure_shard(work)
-
-    monkeypatch.setattr(job, "measure_shard", torn_shard)
-    with pytest.raises(RecordingError, match="frame 21"):
-        run(walk, tmp_path, InTurn())
-
-
-def test_a_short_recording_is_measured_by_one_process(
-    walked: Session, walk: Path, tmp_path: Path
-) -> None:
-    pool = InTurn(fewest=1000)
-    assert tables_of(run(walk, tmp_path, pool)) == tables_of(walked.path)
-    assert pool.n_done == 0
-
-
+@pytest.mark.nightly
 def test_workers_of_this_machine_read_what_an_archive_was_unpacked_to(
     images: np.ndarray, mouse: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

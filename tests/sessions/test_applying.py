@@ -50,7 +50,7 @@ def words_in(bouts: pd.DataFrame) -> list[str]:
     return out
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(words, edits)
 def test_edits_paint_the_frames_that_they_name_and_no_others(
     before: list[str], spans: list[tuple[int, int, str]]
@@ -70,7 +70,7 @@ def test_edits_paint_the_frames_that_they_name_and_no_others(
     assert set(after.loc[~said, "model_hash"]) <= {"hash"}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(words, words, st.sets(st.integers(0, N - 1), min_size=1))
 def test_splicing_takes_some_frames_from_another_ethogram(
     one: list[str], other: list[str], rows: set[int]

@@ -16,9 +16,8 @@ from tests.sessions.walking_mouse import WalkingMouse, steady, write
 MOUSE = WalkingMouse(np.delete(steady(3.0), slice(30, 36)), lost=(40, 41, 70))
 
 
-@pytest.mark.parametrize("size", [7, 50])
 def test_a_table_made_in_blocks_is_the_one_made_at_once(
-    size: int, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     zones = [Zone("side", (150.0, 0.0, 60.0)), Zone("all", (0.0, 0.0, 1e4))]
     arena = Arena("round", (0.0, 0.0), radius_mm=200.0)
@@ -38,7 +37,7 @@ def test_a_table_made_in_blocks_is_the_one_made_at_once(
         } | {"at once": rows.frames_table}
 
     at_once = made()
-    monkeypatch.setattr(rows_module, "ROWS_PER_GROUP", size)
+    monkeypatch.setattr(rows_module, "ROWS_PER_GROUP", 50)
     in_blocks = made()
     for name, table in at_once.items():
         pd.testing.assert_frame_equal(in_blocks[name], table, check_exact=True)

@@ -17,7 +17,6 @@ import liex_lab.sessions.rrd_scene as depth_of
 from liex_lab.body.pose import Pose
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.geometry import SE3
-from liex_lab.recordings import open_recording
 from liex_lab.recordings.depth_kernels import to_millimetres, unpack_rvl
 from liex_lab.recordings.frame import region_mask
 from liex_lab.sessions import Session, SessionWriter, correcting
@@ -130,14 +129,6 @@ def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
             n_unread += int((held[inside] == 0).sum())
             assert inside.all() == (row == UNSEEN), "where nothing was found it is kept whole"
     assert n_unread > 0, "unread pixels stay unread"
-
-
-def test_depth_opened_by_the_index_is_that_of_walking_the_file(session: Session) -> None:
-    with open_depth(session) as images, open_recording(session.path / "session.mcap") as walked:
-        assert len(images) == len(MOUSE.times_s)
-        np.testing.assert_array_equal(images.times_ns, walked.times_ns)
-        np.testing.assert_array_equal(images.frame(9).depth, walked.frame(9).depth)
-        assert images.camera == walked.camera
 
 
 def test_of_a_damaged_replay_no_image_is_taken_for_another_one(

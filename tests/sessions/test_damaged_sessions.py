@@ -98,7 +98,7 @@ def read_all(folder: Path) -> None:
 
 
 @settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(data=st.data())
 def test_any_value_anywhere_in_session_json(whole: Path, copy: Path, data: st.DataObject) -> None:
@@ -109,7 +109,7 @@ def test_any_value_anywhere_in_session_json(whole: Path, copy: Path, data: st.Da
 
 
 @settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(
     name=st.sampled_from(
@@ -140,7 +140,7 @@ def test_any_byte_anywhere_in_its_files(
 
 
 @settings(
-    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(name=st.sampled_from(["checkpoint.json", "seen/columns.json"]), data=st.data())
 def test_any_value_anywhere_in_an_unfinished_session(
@@ -161,7 +161,7 @@ def test_any_value_anywhere_in_an_unfinished_session(
         held.leave(keep=False)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(document=ANYTHING)
 def test_any_json_instead_of_a_failure(document: Any) -> None:
     with tempfile.TemporaryDirectory() as folder:

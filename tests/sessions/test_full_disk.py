@@ -41,11 +41,10 @@ def limited(place: str, limit: int, report: str) -> None:
 @pytest.mark.parametrize(
     "limit",
     [
-        100_000,
-        1_322_000,
+        300_000,
         *(
             pytest.param(limit, marks=pytest.mark.nightly)
-            for limit in (20_000, 300_000, 1_125_000, 1_265_000, 1_380_000)
+            for limit in (20_000, 100_000, 1_125_000, 1_265_000, 1_322_000, 1_380_000)
         ),
     ],
 )

@@ -64,8 +64,8 @@ def in_order_of_time(file: BinaryIO) -> Messages:
 @pytest.mark.parametrize(
     "settings",
     [
-        *({"chunk_size": size, "level": level} for size in (1, 4_000, 10**9) for level in (1, 19)),
-        *({"window": window} for window in (1, 40, 1 << 20, 1 << 33)),
+        *({"chunk_size": size, "level": 19} for size in (1, 10**9)),
+        *({"window": window} for window in (1, 1 << 33)),
     ],
     ids=str,
 )

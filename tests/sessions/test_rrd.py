@@ -282,15 +282,6 @@ def test_the_action_lane_changes_where_the_bouts_do_and_ends_empty(session):
     assert flags == ["not_found", ""]
 
 
-def test_the_colours_spread_over_the_floor_and_an_animal_on_it():
-    depth = np.full((40, 40), 700, np.uint16)
-    depth[10:14, 10:20] = 660
-    near, far = depth_of.colour_range(depth, 700.0)
-    assert near < 640
-    assert 700 < far < 730
-    assert depth_of.colour_range(np.zeros((4, 4), np.uint16), 700.0)[1] > 700
-
-
 def test_a_blueprint_travels_inside_and_both_layouts_lie_beside(tmp_path, strict):
     from liex_lab.dashboards.replay.layouts import replay_blueprint
     from liex_lab.dashboards.report.report import write_views

@@ -4,15 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.body import Skeleton
 from liex_lab.optics.camera import KINECT_V2
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.scene import Fixture, Scene
 from liex_lab.sessions.rrd_scene import (
     FLOOR,
     OVERLAY,
-    dot_mm,
-    dot_pt,
     log_hidden_places,
     log_surroundings,
 )
@@ -67,14 +64,3 @@ def test_the_place_where_the_animal_hid_is_drawn_with_since_when() -> None:
     first = int(np.flatnonzero(track.flag == "hidden")[0])
     (label,) = points.labels.as_arrow_array().to_pylist()
     assert label.startswith(f"hidden {first / 30.0:.1f} to 3.3")
-
-
-def test_two_joints_next_to_each_other_are_two_dots_and_a_fish_is_drawn_thinner():
-    for name in ("mouse", "fish", "hand"):
-        skeleton = Skeleton.load(name)
-        bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
-        assert 2.0 * dot_mm(skeleton) < np.median(bones)
-        assert 1.5 <= dot_pt(skeleton) <= 3.5
-    mouse, fish = Skeleton.load("mouse"), Skeleton.load("fish")
-    assert dot_mm(mouse) == 3.0 > 3.0 * dot_mm(fish)
-    assert dot_pt(mouse) > 2.0 * dot_pt(fish)

@@ -8,7 +8,7 @@ import pytest
 
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import find_faults, find_gaps, make_monotone, median_step
-from liex_lab.tables.rows import Rows, constant_runs, nearness, stop_times
+from liex_lab.tables.rows import Rows, nearness, stop_times
 from liex_lab.tables.schema import GAPS, ROTATIONS, to_pandas
 from tests.sessions.walking_mouse import SD_ROOT, WalkingMouse, steady
 
@@ -86,16 +86,6 @@ def test_the_score_is_the_share_of_gaussian_points_within_the_radius():
         points = rng.normal(0.0, sd, (200_000, 3))
         inside = np.mean(np.linalg.norm(points, axis=1) < radius)
         assert float(nearness(np.array(sd), np.array(radius))) == pytest.approx(inside, abs=0.004)
-
-
-def test_stretches_are_the_runs_a_reader_would_count():
-    labels = np.array(["a", "a", "", "b", "b", "b"])
-    assert [(a, b, str(w)) for a, b, w in constant_runs(labels)] == [
-        (0, 2, "a"),
-        (2, 3, ""),
-        (3, 6, "b"),
-    ]
-    assert constant_runs(np.array([])) == []
 
 
 def test_a_frame_stands_for_the_time_to_the_next_one_but_not_for_a_gap():

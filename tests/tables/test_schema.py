@@ -10,12 +10,9 @@ import pytest
 from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
 from liex_lab.tables.schema import (
-    BOUTS,
-    TABLES,
     Column,
     all_columns,
     dictionary,
-    empty_table,
     to_pandas,
     write_table,
 )
@@ -78,20 +75,6 @@ def test_a_column_cannot_be_described_twice_and_differently():
         dictionary([Column("poses", "x_mm", "float64", "mm", "something else")])
 
 
-def test_per_frame_tables_have_one_row_per_frame_and_joint(session):
-    n, joints = 60, 5
-    assert len(session.frames) == len(session.kinematics) == n
-    assert len(session.poses) == n * joints
-    assert len(session.rotations) == n * (joints + 1)
-    for table in (session.frames, session.poses, session.rotations, session.kinematics):
-        assert table["frame_index"].nunique() == n
-        assert table["time_s"].is_monotonic_increasing
-        assert table["dt_s"].isna().sum() == len(table) // n  # at the first frame only
-    lost = session.frames["frame_index"].isin([10, 11])
-    assert (session.frames.loc[lost, "flag"] == "not_found").all()
-    assert session.poses.loc[session.poses["frame_index"].isin([10, 11]), "x_mm"].isna().all()
-
-
 def test_equal_input_gives_equal_tables_whatever_the_chunks(tmp_path):
     mouse = WalkingMouse(steady(2.0), rear_s=(0.5, 1.2), lost=(3,))
     first, second = (
@@ -116,14 +99,6 @@ def test_parquet_files_are_zstd_and_describe_themselves(session):
         assert set(about["columns"]) == set(file.schema_arrow.names)
         if file.metadata.num_row_groups:
             assert file.metadata.row_group(0).column(0).compression == "ZSTD"
-
-
-def test_tables_without_rows_keep_their_columns(session):
-    flips = session.flips
-    assert len(flips) == 0
-    assert list(flips.columns) == [column.name for column in TABLES["flips"]]
-    assert {"p_flip", "applied", "source", "undone_at"} <= set(flips.columns)
-    assert empty_table(BOUTS)["start_s"].dtype == np.float64
 
 
 def test_a_block_becomes_the_frame_that_reading_it_back_gives(session, tmp_path):

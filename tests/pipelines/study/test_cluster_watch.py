@@ -69,6 +69,7 @@ def test_a_process_that_has_ended_and_is_not_fetched_yet_is_none(
     assert "could not be started again" in reason
 
 
+@pytest.mark.nightly
 def test_a_study_whose_workers_are_gone_for_good_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "_NONE_LEFT_S", 1.0)
     monkeypatch.setattr(cluster, "WORKERS_EVERY_S", 0.2)

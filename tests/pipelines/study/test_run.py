@@ -134,6 +134,7 @@ def test_workers_share_the_cores_and_the_sessions_that_are_left(
     assert {document["threads"] for document in about.values()} == {str(cores)}
 
 
+@pytest.mark.nightly
 def test_all_workers_share_the_stretches_of_one_session() -> None:
     with cluster.crew_of(2, workers=2, threads=1) as crew:
         found = crew.client.submit(shared_task, 6, pure=False).result(timeout=120)
@@ -298,11 +299,10 @@ def test_dry_run_changes_nothing_and_lists_recordings_that_never_were(tmp_path: 
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("options", [["--dry-run"], []])
-def test_a_session_whose_recording_is_gone_is_not_done(tmp_path: Path, options: list[str]) -> None:
+def test_a_session_whose_recording_is_gone_is_not_done(tmp_path: Path) -> None:
     file = one_session(tmp_path)
     (tmp_path / "rawdata" / "good.mcap").unlink()
-    result = CliRunner().invoke(cli.app, ["cohort", str(file), *options])
+    result = CliRunner().invoke(cli.app, ["cohort", str(file)])
     assert result.exit_code == 3, result.output
     assert "missing  sub-good_ses-01  there is no recording " in result.output
     assert "1 session: 1 recording missing" in result.output

@@ -24,6 +24,7 @@ def make_study(folder: Path, seeds: list[int], n_frames: int) -> Path:
     return folder / "study.toml"
 
 
+@pytest.mark.nightly
 def test_two_sessions_of_one_mouse_have_one_length_and_the_report_says_whose(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -128,15 +128,6 @@ def test_nothing_is_shared_or_looked_at_unless_the_study_says_so(tmp_path: Path)
         Study.load(make_study(tmp_path, {}, 'shared = "cage"\n'))
 
 
-def test_the_order_of_the_sessions_and_of_the_looks_does_not_matter(tmp_path: Path) -> None:
-    lengths = {"m07/a": 80.0, "m07/b": 84.0, "m07/c": 81.5}
-    one = run(make_study(tmp_path / "one", lengths))
-    other = run(make_study(tmp_path / "other", dict(reversed(lengths.items()))))
-    assert {name: measured_by(found) for name, found in one.items()} == {
-        name: measured_by(found) for name, found in other.items()
-    }
-
-
 def test_an_interrupted_study_goes_on_to_the_same_and_looks_at_nobody_twice(
     tmp_path: Path,
 ) -> None:
