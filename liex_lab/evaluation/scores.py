@@ -10,13 +10,15 @@ Lie-X (section 5) scores a frame by its mean per-joint position error,
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.runtime.memory import Rows
 from liex_lab.tracking.track import spans
 
 if TYPE_CHECKING:
@@ -85,7 +87,7 @@ def is_flipped(joints: Array, truth: Array, tip: int) -> Mask:
 
 
 @dataclass(frozen=True)
-class PoseErrors:
+class PoseErrors(Rows):
     """Errors of measured against true poses in n frames.
 
     Attributes:
@@ -119,14 +121,8 @@ class PoseErrors:
         """
         joint_mm = np.linalg.norm(joints - true_joints, axis=-1)
         flipped = is_flipped(joints, true_joints, tip)
-        bounds = (predicted_mm * quantiles[0], predicted_mm * quantiles[1])
+        bounds = np.multiply.outer(quantiles, predicted_mm)
         return PoseErrors(joint_mm.mean(axis=1), joint_mm, flipped, predicted_mm, *bounds)
-
-    @staticmethod
-    def join(parts: list[PoseErrors]) -> PoseErrors:
-        """Concatenate the errors of several recordings."""
-        names = PoseErrors.__annotations__
-        return PoseErrors(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
 
     def summary(self) -> dict[str, Any]:
         """The numbers of `liex evaluate pose` by name.
@@ -242,11 +238,6 @@ class Followed:
         """(n, J, 3) bool, whether a joint coordinate lies within its 90 % interval."""
         return np.asarray(np.abs(self.joints - self.truth) <= 1.645 * self.sd_mm)
 
-    @property
-    def covered(self) -> Mask:
-        """(m,) bool, `inside` of the coordinates with both a pose and a standard deviation."""
-        return self.inside[np.isfinite(self.joints) & np.isfinite(self.sd_mm)]
-
     def in_view(self, events: Sequence[Event], length_mm: float) -> Array:
         """Errors (m,) mm of the frames in which at least half of the animal is visible.
 
@@ -271,12 +262,11 @@ class Followed:
             Counts; the rest of the sequence if the animal is not found.
         """
         near = self.error_mm < 0.12 * length_mm
-        found = []
-        for event in events:
-            if event.kind in ("hidden", "occluder") and event.stop < len(near):
-                again = np.flatnonzero(near[event.stop :])
-                found.append(int(again[0]) if len(again) else len(near) - event.stop)
-        return found
+        return [
+            int(np.append(near[event.stop :], True).argmax())
+            for event in events
+            if event.kind in ("hidden", "occluder") and event.stop < len(near)
+        ]
 
 
 def tracking_figures(
@@ -322,7 +312,11 @@ def tracking_figures(
         "in_view_p95_ratio": float(np.quantile(own, 0.95) / np.quantile(others, 0.95)),
         "lost_rate": float(1.0 - posed.mean()),
         "longest_flip_frames": max(row.longest_flip for row in rows),
-        "interval90_coverage": float(np.concatenate([row.covered for row in rows]).mean()),
+        "interval90_coverage": float(
+            np.concatenate(
+                [row.inside[np.isfinite(row.joints) & np.isfinite(row.sd_mm)] for row in rows]
+            ).mean()
+        ),
         "recovery_frames": max(recovery) if recovery else None,
         "frames_per_s": float(np.mean([row.frames_per_s for row in rows])),
     }
@@ -341,31 +335,14 @@ class MeasuredIndividual:
     trusted: Mask
 
 
-@dataclass
 class Tally:
-    """Counts over recordings of one scene, from which its results are computed.
+    """Counts over recordings of one scene, from which its results are computed."""
 
-    Attributes:
-        n_frames: of the recordings.
-        in_view: pairs of frame and animal in view.
-        found: of them, with a pose.
-        hidden: pairs of frame and animal that are hidden.
-        hidden_right: of them, without a trusted pose.
-        trusted: pairs of frame and individual that are flagged as trusted.
-        wrong: of them, with a wrong pose.
-        errors_mm: errors of the poses in view, mm, an array for each animal.
-        flipped: whether head and tail are exchanged in these poses, an array for each animal.
-    """
-
-    n_frames: int = 0
-    in_view: int = 0
-    found: int = 0
-    hidden: int = 0
-    hidden_right: int = 0
-    trusted: int = 0
-    wrong: int = 0
-    errors_mm: list[Array] = field(default_factory=lambda: [np.zeros(0)])
-    flipped: list[Mask] = field(default_factory=lambda: [np.zeros(0, np.bool_)])
+    def __init__(self) -> None:
+        self._n: Counter[str] = Counter()  # frames, or pairs of frame and animal or individual
+        # of the poses in view, an array for each animal
+        self._errors_mm = [np.zeros(0)]
+        self._flipped = [np.zeros(0, np.bool_)]
 
     def add(
         self,
@@ -385,44 +362,45 @@ class Tally:
             fits: whether the animals are of the plan's kind; if not, every trusted frame is wrong
                 and nothing else is counted.
         """
-        self.n_frames += n_frames
         pairs = matched(truths, individuals) if fits else {}
-        for k, one in enumerate(individuals):
-            trusted = int(one.trusted.sum())
-            self.trusted += trusted
-            self.wrong += 0 if k in pairs.values() else trusted
+        trusted = [int(one.trusted.sum()) for one in individuals]
+        alone = sum(n for k, n in enumerate(trusted) if k not in pairs.values())
+        self._n += Counter(frames=n_frames, trusted=sum(trusted), wrong=alone)
         for t, truth in enumerate(truths if fits else ()):
             there = np.isfinite(truth.joints_camera).all(axis=(1, 2))
             view = there & (truth.visible >= 0.5)
             hidden = there & (truth.visible <= 0.25)
-            self.in_view += int(view.sum())
-            self.hidden += int(hidden.sum())
+            self._n += Counter(in_view=int(view.sum()), hidden=int(hidden.sum()))
             if t not in pairs:
-                self.hidden_right += int(hidden.sum())
+                self._n["hidden_right"] += int(hidden.sum())
                 continue
             one = individuals[pairs[t]]
             error = error_of(one.joints_camera, truth.joints_camera)
             rows = view & np.isfinite(one.joints_camera).all(axis=(1, 2))
-            self.found += int(rows.sum())
-            self.hidden_right += int((hidden & ~one.trusted).sum())
-            self.wrong += int((one.trusted & ~(error <= FAR * truth.spine_mm)).sum())
-            self.errors_mm.append(error[rows])
-            joints, true = one.joints_camera[rows], truth.joints_camera[rows]
-            self.flipped.append(is_flipped(joints, true, tip))
+            self._n += Counter(
+                found=int(rows.sum()),
+                hidden_right=int((hidden & ~one.trusted).sum()),
+                wrong=int((one.trusted & ~(error <= FAR * truth.spine_mm)).sum()),
+            )
+            self._errors_mm.append(error[rows])
+            self._flipped.append(
+                is_flipped(one.joints_camera[rows], truth.joints_camera[rows], tip)
+            )
 
     def figures(self) -> dict[str, Any]:
         """Results of the scene, see `SCENES_PROTOCOL`; None for those without frames."""
-        errors = np.concatenate(self.errors_mm)
+        errors = np.concatenate(self._errors_mm)
         some = len(errors) > 0
+        n = self._n
         return {
-            "n_frames": self.n_frames,
-            "found": self.found / self.in_view if self.in_view else None,
+            "n_frames": n["frames"],
+            "found": n["found"] / n["in_view"] if n["in_view"] else None,
             "mean_joint_error_mm": float(errors.mean()) if some else None,
             "median_joint_error_mm": float(np.median(errors)) if some else None,
-            "flips": float(np.concatenate(self.flipped).mean()) if some else None,
-            "hidden_right": self.hidden_right / self.hidden if self.hidden else None,
-            "trusted": self.trusted / max(self.n_frames, 1),
-            "wrong_but_trusted": self.wrong / self.trusted if self.trusted else 0.0,
+            "flips": float(np.concatenate(self._flipped).mean()) if some else None,
+            "hidden_right": n["hidden_right"] / n["hidden"] if n["hidden"] else None,
+            "trusted": n["trusted"] / max(n["frames"], 1),
+            "wrong_but_trusted": n["wrong"] / n["trusted"] if n["trusted"] else 0.0,
         }
 
 
@@ -438,11 +416,10 @@ def matched(
     """
     from scipy.optimize import linear_sum_assignment
 
-    cost = np.zeros((len(truths), len(individuals)))
-    for t, truth in enumerate(truths):
-        for k, one in enumerate(individuals):
-            error = error_of(one.joints_camera, truth.joints_camera)
-            spine = truth.spine_mm
-            cost[t, k] = np.minimum(np.nan_to_num(error, nan=spine), spine).mean()
-    rows, columns = linear_sum_assignment(cost)
-    return {int(t): int(k) for t, k in zip(rows, columns, strict=True)}
+    def cost(truth: TrueAnimal, one: MeasuredIndividual) -> float:
+        error = np.nan_to_num(error_of(one.joints_camera, truth.joints_camera), nan=truth.spine_mm)
+        return float(np.minimum(error, truth.spine_mm).mean())
+
+    costs = np.array([[cost(truth, one) for one in individuals] for truth in truths])
+    rows, columns = linear_sum_assignment(costs.reshape(len(truths), len(individuals)))
+    return dict(zip(rows.tolist(), columns.tolist(), strict=True))
