@@ -20,8 +20,7 @@ from liex_lab.errors import PlanError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.session_shape import labels_of
-from liex_lab.optics.camera import Camera, Distortion, Lens, preset
-from liex_lab.optics.refraction import Water
+from liex_lab.optics.camera import Camera, Distortion, Lens, Water, preset
 from liex_lab.plan import Plan, known_plans, sections
 from liex_lab.recordings import depth_kernels, frame, open_recording, rectify
 from liex_lab.recordings.recording import Recording

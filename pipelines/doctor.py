@@ -26,7 +26,7 @@ from liex_lab.errors import (
     UnknownTimesError,
     printable,
 )
-from liex_lab.optics import camera, refraction
+from liex_lab.optics import camera
 from liex_lab.plan import Plan, sections
 from liex_lab.plan.plan import arena_lines
 from liex_lab.recordings import rectify, timestamps
@@ -409,7 +409,7 @@ _WIDER = 20.0
 def scene_facts(
     ideal: Recording,
     plan: Plan,
-    water: refraction.Water | None,
+    water: camera.Water | None,
     sample: NDArray[np.float32],
     stride: int,
 ) -> tuple[dict[str, Any], list[str]]:
@@ -553,9 +553,7 @@ def _floor_facts(
     return {"noise_mm": noise, "floor_unread_share": unread, "arena": arena.to_dict()}, problems
 
 
-def _water_depth(
-    water: refraction.Water, floor: Floor, distance_mm: float
-) -> tuple[float, list[str]]:
+def _water_depth(water: camera.Water, floor: Floor, distance_mm: float) -> tuple[float, list[str]]:
     """Depth of the water below the lens, mm, and whether its surface contradicts the floor."""
     cosine = float(floor.normal @ water.normal)
     deep = distance_mm / cosine - water.height_mm

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from liex_lab.pipelines.study.cluster import SlurmTable
 
+from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import PRESETS, Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.scene.zones import read_zones
 from tests.damage import ANYTHING, check, damage
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.kinematics import kinematics
 from liex_lab.optics import camera as cameras
-from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera, Distortion
-from liex_lab.optics.refraction import Water
+from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera, Distortion, Water
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import TAIL_RINGS
 from liex_lab.body.pose import Pose, aim
-from liex_lab.body.shape import Body, BodyShape, Capsules, MeshBody
+from liex_lab.body.shape import Body, BodyShape, Capsules, MeshBody, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import so3
 from liex_lab.runtime.memory import Rows

@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
+from liex_lab.body.shape import BodyShape, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.refine import ridge_regression
 from liex_lab.geometry import SE3

@@ -15,8 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.optics.camera import Camera
-from liex_lab.optics.refraction import Water
+from liex_lab.optics.camera import Camera, Water
 from liex_lab.recordings import depth_kernels as kernels
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording

@@ -33,9 +33,8 @@ from numpy.typing import NDArray
 
 from liex_lab.actions import vocabulary
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
+from liex_lab.body.shape import BodyShape, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.estimation.session_shape import built
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import Body
+from liex_lab.body.shape import Body, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera

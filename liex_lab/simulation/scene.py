@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.body._skinning_kernels import joined_faces
-from liex_lab.body.surface import render_mesh
+from liex_lab.body.shape import render_mesh
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 

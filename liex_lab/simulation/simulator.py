@@ -24,13 +24,13 @@ from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
 from liex_lab.simulation import corruptions, training_patches
 from liex_lab.simulation.corruptions import Event, Loss
-from liex_lab.simulation.hand.pose_prior import find_reference
 from liex_lab.simulation.hand.simulator import (
     FRAME_NS,
     NYU_SENSOR,
     HandFrameContents,
     HandSession,
     HandSimulator,
+    find_reference,
 )
 from liex_lab.simulation.locomotion import moving_session
 from liex_lab.simulation.recording import (

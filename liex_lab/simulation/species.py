@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import Body, BodyShape
+from liex_lab.body.shape import Body, BodyShape, Surface
 from liex_lab.body.skeleton import VIEWS, Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.body.variation import draw_shapes, draw_tail_bends, vary_body
 from liex_lab.optics.camera import (
     AZURE_KINECT,

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import Body
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import Body, Surface
 from liex_lab.geometry import SE3
 from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.processes import in_parallel

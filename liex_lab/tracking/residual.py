@@ -27,9 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
+from liex_lab.body.shape import BodyShape, Surface, render_meshes
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3
 from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.processes import in_parallel

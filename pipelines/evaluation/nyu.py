@@ -28,7 +28,7 @@ from liex_lab.recordings.formats.images.nyu import (
     points_of_joints,
 )
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.hand.pose_prior import OBSERVED_SHARE
+from liex_lab.simulation.hand.simulator import OBSERVED_SHARE
 
 from ..build import build_estimator, build_recording, build_scene
 

@@ -28,11 +28,11 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.baselines import baseline, cnn
+from liex_lab.baselines import baseline
 from liex_lab.baselines.baseline import Baseline
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import FOREGROUNDS, Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.catalog import bundled_models, find_model
 from liex_lab.estimation.cascade import ImageSet, TrainingSet, Truth
 from liex_lab.estimation.estimator import PoseEstimator
@@ -564,16 +564,16 @@ class Training:
     """
 
     recipe: Recipe
-    plan: baseline.ForestPlan | cnn.CnnPlan
+    plan: baseline.ForestPlan | baseline.CnnPlan
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values of the training, a cache key: equal values mean equal training."""
         return {"recipe": vars(self.recipe), "plan": asdict(self.plan)}
 
 
-BASELINES: dict[str, baseline.ForestPlan | cnn.CnnPlan] = {
+BASELINES: dict[str, baseline.ForestPlan | baseline.CnnPlan] = {
     "rf": baseline.ForestPlan(),
-    "cnn": cnn.CnnPlan(),
+    "cnn": baseline.CnnPlan(),
 }
 _SEEN = 122_880  # total views of the CNN, whatever the number of images
 
@@ -591,7 +591,7 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
     """
     recipe = replace(recipe_of("paper", skeleton), n_calibration=0)
     plan = BASELINES[variant]
-    if isinstance(plan, cnn.CnnPlan):
+    if isinstance(plan, baseline.CnnPlan):
         plan = replace(plan, epochs=round(_SEEN / recipe.n_images))
     else:
         plan = replace(plan, home_turn=method_of("paper", skeleton).home_turn)
@@ -610,14 +610,14 @@ def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> 
         MissingPackageError: the variant is `cnn` and torch is not installed.
     """
     if variant == "cnn":
-        cnn.require_torch()  # before anything is rendered
+        baseline.require_torch()  # before anything is rendered
     skeleton = Skeleton.load(animal)
     training = training_of(variant, skeleton)
     path = cached_baseline(variant, skeleton, training)
     if not path.is_file():
         train_baseline(variant, skeleton, training, path, progress)
-    if isinstance(training.plan, cnn.CnnPlan):
-        return cnn.Cnn.load(path, skeleton, training.plan)
+    if isinstance(training.plan, baseline.CnnPlan):
+        return baseline.Cnn.load(path, skeleton, training.plan)
     return baseline.RegressionForest.load(path, skeleton, training.plan)
 
 
@@ -668,13 +668,13 @@ def train_baseline(
 
 def fit(
     training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback
-) -> baseline.RegressionForest | cnn.Cnn:
+) -> baseline.RegressionForest | baseline.Cnn:
     """Train a baseline on rendered images.
 
     Raises:
         MissingPackageError: the plan is of the CNN and torch is not installed.
     """
     rng = np.random.default_rng(training.recipe.seed)
-    if isinstance(training.plan, cnn.CnnPlan):
-        return cnn.train_cnn(data, skeleton, training.plan, rng, tell)
+    if isinstance(training.plan, baseline.CnnPlan):
+        return baseline.train_cnn(data, skeleton, training.plan, rng, tell)
     return baseline.train_forests(data, skeleton, training.plan, rng, tell)

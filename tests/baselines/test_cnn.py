@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from liex_lab.baselines._kernels import PATCH
-from liex_lab.baselines.cnn import frames_of, joints_of, patches_of, targets_of
+from liex_lab.baselines.baseline import frames_of, joints_of, patches_of, targets_of
 from liex_lab.estimation.method import METHODS
 from liex_lab.scene.height_maps import in_camera_frame, in_view_frame
 from tests.estimation.toy import toy_mice, training_set
@@ -132,7 +132,7 @@ def test_view_and_camera_frame_undo_each_other(data):
 if find_spec("torch"):  # an extra that the tests do without: see `cnn` in pyproject.toml
 
     def test_a_small_network_learns_forgets_nothing_on_the_way_to_disk_and_repeats(data, tmp_path):
-        from liex_lab.baselines.cnn import Cnn, CnnPlan, train_cnn
+        from liex_lab.baselines.baseline import Cnn, CnnPlan, train_cnn
 
         plan = CnnPlan(width=0.125, connected=32, epochs=10)
         toy = toy_mice(64, 6)

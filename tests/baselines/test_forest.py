@@ -27,7 +27,7 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
-from liex_lab.simulation.hand.pose_prior import draw_observed
+from liex_lab.simulation.hand.simulator import draw_observed
 from tests.estimation.toy import FLOOR, SCENE, Toy, toy_mice, trained, training_set, unseen
 
 PAPER = METHODS["paper"]

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.shape import MeshBody
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import MeshBody, Surface
 from liex_lab.body.variation import vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError

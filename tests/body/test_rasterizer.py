@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.surface import Surface, render_mesh, render_meshes
+from liex_lab.body.shape import Surface, render_mesh, render_meshes
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import KINECT_V2, Camera
 from tests.oracles.raster import ray_cast_depth

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.shape import Spheres
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import Spheres, Surface
 from liex_lab.estimation._residual_kernels import place_balls
 from liex_lab.estimation.cascade import body_of
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.shape import BodyShape
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import BodyShape, Surface
 from liex_lab.body.variation import FAMILIES, draw_hands, draw_shapes, draw_tail_bends, vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError

@@ -5,9 +5,8 @@ reaches.
 import numpy as np
 import pytest
 
-from liex_lab.body.shape import BodyShape, Capsules
+from liex_lab.body.shape import BodyShape, Capsules, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.body.variation import FAMILIES, vary_body
 from liex_lab.catalog import find_sample
 

@@ -22,7 +22,7 @@ from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.activity import around_onsets
 from liex_lab.body import Skeleton
 from liex_lab.exchange import export
-from liex_lab.optics.refraction import Water
+from liex_lab.optics.camera import Water
 from liex_lab.sessions import Session, SessionWriter
 from liex_lab.sessions.verdict import Verdict
 from tests.conftest import REPOSITORY

@@ -9,9 +9,8 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import Spheres
+from liex_lab.body.shape import Spheres, Surface, render_mesh
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface, render_mesh
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation._residual_kernels import place_balls
 from liex_lab.estimation.cascade import ImageSet
@@ -21,7 +20,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import HandSegmenter, sight_rotations
 from liex_lab.scene.height_maps import HeightMaps, view_of
-from liex_lab.simulation.hand.pose_prior import draw_observed
+from liex_lab.simulation.hand.simulator import draw_observed
 from tests.oracles.explain import explained
 
 HAND = Skeleton.load("hand")

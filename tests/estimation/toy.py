@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
+from liex_lab.body.shape import BodyShape, Surface, render_meshes
 from liex_lab.body.skeleton import PRESETS, Skeleton
-from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.estimation.cascade import Candidates, ImageSet, TrainingSet, Truth
 from liex_lab.estimation.method import METHODS, Method
 from liex_lab.estimation.model import ErrorCalibration, Model

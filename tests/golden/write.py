@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from liex_lab.optics.camera import Camera
-from liex_lab.optics.refraction import Water
+from liex_lab.optics.camera import Camera, Water
 from liex_lab.plan import Plan
 from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.scene.scene import Arena

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liex_lab.errors import LiexError
-from liex_lab.optics.camera import PRIMESENSE
-from liex_lab.optics.refraction import RANGINGS, Water
+from liex_lab.optics.camera import PRIMESENSE, RANGINGS, Water
 from tests.oracles.refraction import ray_to, seen, true_points
 
 TRACED = [ranging for ranging in RANGINGS if ranging != "paraxial"]

@@ -8,8 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.optics.camera import Camera
-from liex_lab.optics.refraction import Water
+from liex_lab.optics.camera import Camera, Water
 from tests.oracles.refraction import seen
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ law alone.
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from liex_lab.optics.refraction import Water
+from liex_lab.optics.camera import Water
 
 Array = NDArray[np.float64]
 

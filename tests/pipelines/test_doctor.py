@@ -26,12 +26,12 @@ from liex_lab.optics.camera import (
     PRESETS,
     Camera,
     Distortion,
+    Water,
     of_size,
     preset,
     unusual_centre,
     unusual_lens,
 )
-from liex_lab.optics.refraction import Water
 from liex_lab.plan import Plan
 from liex_lab.plan.sections import CameraName
 from liex_lab.scene.floor import Floor

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.optics.camera import Camera, Distortion
-from liex_lab.optics.refraction import RANGINGS, Water
+from liex_lab.optics.camera import RANGINGS, Camera, Distortion, Water
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.rectify import (
     ideal_camera,

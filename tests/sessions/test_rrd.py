@@ -13,8 +13,7 @@ import liex_lab.sessions.rrd as replay
 import liex_lab.sessions.rrd_scene as depth_of
 import liex_lab.sessions.rrd_scene as scene_of
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import BodyShape, Surface
 from liex_lab.geometry import SE3, so3
 from liex_lab.recordings.timestamps import find_gaps, median_step
 from liex_lab.scene.scene import Arena

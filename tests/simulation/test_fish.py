@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.optics.camera import RAYTRIX_R5
 from liex_lab.simulation.locomotion import moving_session
 from liex_lab.simulation.pose_prior import FISH_KINDS, draw_bends

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Skeleton
-from liex_lab.simulation.hand.pose_prior import (
-    STATISTICS,
-    draw_observed,
-    draw_wide,
-)
+from liex_lab.simulation.hand.simulator import STATISTICS, draw_observed, draw_wide
 
 HAND = Skeleton.load("hand")
 

@@ -9,9 +9,8 @@ import pytest
 from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON, NyuReference
-from liex_lab.simulation.hand import pose_prior
-from liex_lab.simulation.hand.pose_prior import find_reference
-from liex_lab.simulation.hand.simulator import HandSimulator
+from liex_lab.simulation.hand import simulator
+from liex_lab.simulation.hand.simulator import HandSimulator, find_reference
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.training_patches import TrainingPatches
 
@@ -109,9 +108,9 @@ def test_the_labels_are_looked_for_in_one_place_whatever_folder_a_command_runs_i
     monkeypatch.delenv("LIEX_NYU", raising=False)
     monkeypatch.chdir(tmp_path)  # what lies in the current folder does not count
     for repository, found in ((tmp_path / "far" / "code", None), (tmp_path / "code", beside)):
-        monkeypatch.setattr(pose_prior, "_REPOSITORY", repository)
+        monkeypatch.setattr(simulator, "_REPOSITORY", repository)
         assert find_reference() == found
-    monkeypatch.setattr(pose_prior, "_REPOSITORY", tmp_path / "far" / "code")
+    monkeypatch.setattr(simulator, "_REPOSITORY", tmp_path / "far" / "code")
     monkeypatch.setenv("LIEX_NYU", str(beside))
     assert find_reference() == beside
     monkeypatch.setenv("LIEX_NYU", str(tmp_path))

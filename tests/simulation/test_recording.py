@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import Surface
 from liex_lab.errors import LiexError
 from liex_lab.runtime.processes import threads
 from liex_lab.simulation.locomotion import walking_session

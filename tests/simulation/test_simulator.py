@@ -5,8 +5,8 @@ moves as it can.
 import numpy as np
 import pytest
 
+from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.scene.learning import learn_scene

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import Surface, render_meshes
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import Surface, render_meshes
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.scene.background_segmenter import BackgroundSubtraction

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.body.shape import BodyShape
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import BodyShape, Surface
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior, labels_of
 from liex_lab.tracking.own_shape import (

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter, lfilter_zi
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import Body
-from liex_lab.body.surface import Surface
+from liex_lab.body.shape import Body, Surface
 from liex_lab.scene.height_maps import Patches
 from liex_lab.simulation._render_kernels import WALL_COLUMNS, part_of
 from liex_lab.simulation._sensor_kernels import ANIMAL, UNIT

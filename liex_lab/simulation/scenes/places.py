@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import tube_faces
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
+from liex_lab.body.shape import BodyShape, render_mesh
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.body.surface import render_mesh
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.locomotion import smoothed

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.shape import BodyShape
-from liex_lab.body.surface import Surface, render_mesh
+from liex_lab.body.shape import BodyShape, Surface, render_mesh
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation._render_kernels import part_of

@@ -25,7 +25,7 @@ import numba
 from liex_lab.dashboards.paper.page import write_paper
 
 from liex_lab.actions.storage import load_action_model
-from liex_lab.baselines.cnn import CnnPlan, require_torch
+from liex_lab.baselines.baseline import CnnPlan, require_torch
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import bundled_models, kept_results_folder
 from liex_lab.errors import LiexError, MissingPackageError, PlanError
