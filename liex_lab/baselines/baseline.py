@@ -702,6 +702,26 @@ def torch_threads(parallel: bool) -> Iterator[None]:
 class Cnn(Baseline):
     """The trained network as a baseline.
 
+    Lie-X section 5.2. The paper fine-tunes an AlexNet pre-trained on ImageNet for 50 epochs on its
+    95,000 to 104,000 images. This one is trained from scratch, since weights learned from
+    photographs are not available here, within a budget of two CPU cores (`CnnPlan`). Therefore it
+    has batch normalisation after every convolution, without which an AlexNet hardly learns from
+    scratch in so few steps; no dropout, since no image is used more than a few times; and fully
+    connected layers of 1,024 instead of 4,096. The five convolutions are AlexNet's (Krizhevsky
+    2014, one column), at a `width` of its numbers of channels. Products use bfloat16, which takes
+    half the time on CPUs that support it. The loss is the mean distance of the joints,
+
+        L = 1/J sum_j |y_j - y_j*|,        in half sides of the patch.
+
+    A patch is the square around the animal's bounding box, a tenth larger, resampled to 224 x 224.
+    Depth is scaled by the same factor as the image, so the animal keeps its proportions (the paper
+    only states "rescaled to be in the range of 0 to 255"): 127.5 is the animal's mean depth, and
+    half the square's side in mm maps to 0 or 255. Nearer is brighter; the background is 0. Joints
+    have the same unit: (right, down, nearer) from the square's centre at the animal's mean depth,
+    in half sides of the square.
+
+    torch is an optional dependency: `pip install '.[cnn]'` in the folder of liex_lab.
+
     It estimates joints, not a pose: bone lengths are not constrained.
     """
 

@@ -522,6 +522,12 @@ _SILHOUETTE_PX = 400
 class Surface:
     """A mesh of fixed topology that follows a skeleton.
 
+    A skeleton's [surface] table defines its kind: `stations` with half widths and heights make a
+    tube along one chain of joints, a generalised cylinder with superelliptic cross-sections (the
+    mouse); `radii_mm` a tapered capsule around every bone and `capsules` additional ones (any other
+    animal); `mesh` is the file of the user's own body, deformed by linear blend skinning. Depth is
+    rendered with a z-buffer, see `_rasterizer_kernels`.
+
     Attributes:
         skeleton: of the poses.
         faces: (F, 3) int32, indices of the vertices (V, 3) of every pose.

@@ -60,7 +60,12 @@ OBSERVED_SHARE = 1.0 - _FREE_SHARE  # share based on the labelled points of NYU 
 
 @cache
 def _mixture(name: str, *columns: str) -> tuple[Array, ...]:
-    """Weights (K,) of the kinds of a bundled mixture, and columns (K, ...) of degrees as rad."""
+    """Weights (K,) of the kinds of a bundled mixture, and columns (K, ...) of degrees as rad.
+
+    Each of eight kinds of posture has a mean, six principal axes and a residual deviation, as in
+    mixtures of probabilistic PCA; each of eight orientations is a Gaussian in the tangent space of
+    SO(3), R = R_k exp(delta).
+    """
     kinds = tomllib.loads(STATISTICS.read_text(encoding="utf-8"))[name]
     share = np.array([kind["share"] for kind in kinds])
     return share / share.sum(), *(np.radians([kind[c] for kind in kinds]) for c in columns)
