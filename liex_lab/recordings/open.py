@@ -5,7 +5,6 @@ archive by `liex pack`, is also recognised by its first bytes. A reader's module
 are imported on demand.
 """
 
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,21 +21,15 @@ _READS = (
     "camera with a raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or "
     ".tar.gz), a PrimeSense recording (.oni), an MCAP file or a ROS bag (.bag, .db3)"
 )
-_PICTURES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
-_ALONE = {  # suffix of a file that is a whole recording: its module and function
-    ".tar.gz": "moseq.open_moseq",
-    ".tgz": "moseq.open_moseq",
-    ".tar": "moseq.open_moseq",
-    ".avi": "moseq.open_moseq",
-    ".mkv": "moseq.open_moseq",
-    ".mcap": "messages.mcap.open_mcap",
-    ".oni": "oni.open_oni",
-    ".bag": "messages.rosbag.open_bag",
-    ".db3": "messages.rosbag.open_bag",
+_IMAGES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
+_MOSEQ = ("moseq", "open_moseq")
+_ALONE = {  # suffix of a file that is a whole recording: module and function of its reader
+    **dict.fromkeys((".tar.gz", ".tgz", ".tar", ".avi", ".mkv"), _MOSEQ),
+    ".mcap": ("messages.mcap", "open_mcap"),
+    ".oni": ("oni", "open_oni"),
+    **dict.fromkeys((".bag", ".db3"), ("messages.rosbag", "open_bag")),
 }
-_FILES = (
-    _ALONE | {".dat": "moseq.open_moseq"} | dict.fromkeys(_PICTURES, "images.folder.open_images")
-)
+_FILES = _ALONE | {".dat": _MOSEQ} | dict.fromkeys(_IMAGES, ("images.folder", "open_images"))
 _MCAP = b"\x89MCAP0\r\n"
 _PACKED = "is packed, and only .tar.gz is read as it is; unpack it{} and give the result"
 _NOT_READ = {
@@ -72,32 +65,6 @@ _NOT_READ = {
 }
 
 
-@dataclass(frozen=True)
-class _How:
-    """Options of `open_recording` besides the path."""
-
-    camera: Lens | None
-    fps: float | None
-    topic: str | None
-    progress: Progress
-    pattern: str | None = None
-    strict: bool = False
-
-    def open(self, where: str, path: Path) -> Recording:
-        """Open with the function `where` of `formats`, as in "oni.open_oni", imported on demand."""
-        module, name = where.rsplit(".", 1)
-        opener = getattr(import_module(f"liex_lab.recordings.formats.{module}"), name)
-        more: dict[str, dict[str, Any]] = {
-            "open_images": {"pattern": self.pattern},
-            "open_bag": {"topic": self.topic},
-            "open_mcap": {"topic": self.topic, "strict": self.strict},
-        }
-        recording: Recording = opener(
-            path, self.camera, self.fps, self.progress, **more.get(name, {})
-        )
-        return recording
-
-
 def open_recording(
     path: str | Path,
     *,
@@ -129,7 +96,20 @@ def open_recording(
     """
     path = Path(path)
     try:
-        recording = _open(path, _How(camera, fps, topic, progress, pattern, strict))
+        recording: Recording
+        # address of a virtual recording; rendering is a higher layer than reading, so only named
+        if str(path).startswith("synthetic:"):
+            simulator = import_module("liex_lab.simulation.simulator")
+            recording = simulator.open_synthetic(str(path), camera)
+        else:
+            (module, name), file = _reader_of(path)
+            reader = import_module(f"liex_lab.recordings.formats.{module}")
+            more: dict[str, dict[str, Any]] = {
+                "open_images": {"pattern": pattern},
+                "open_bag": {"topic": topic},
+                "open_mcap": {"topic": topic, "strict": strict},
+            }
+            recording = getattr(reader, name)(file, camera, fps, progress, **more.get(name, {}))
     except OSError as error:
         raise RecordingError(
             f"{error.filename or path} cannot be read ({error.strerror or error}); check it"
@@ -181,40 +161,39 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
     return str(facts.get("subject_id", ""))
 
 
-def _open(path: Path, how: _How) -> Recording:
-    # address of a virtual recording; rendering is a higher layer than reading, so only named here
-    if str(path).startswith("synthetic:"):
-        rendered: Recording = import_module("liex_lab.simulation.simulator").open_synthetic(
-            str(path), how.camera
-        )
-        return rendered
+def _reader_of(path: Path) -> tuple[tuple[str, str], Path]:
+    """Module and function of `formats` that reads a path, and the file or folder to read.
+
+    Raises:
+        RecordingError: it is no recording that can be read.
+    """
+    from liex_lab.recordings.formats.images.nyu import looks_like_nyu
+
     if not path.exists():
         raise RecordingError(f"there is no file or folder {path}; check the spelling")
     if path.is_dir():
-        return _open_folder(path, how)
-    from liex_lab.recordings.formats.images.nyu import looks_like_nyu
-
+        return _reader_of_folder(path)
     if looks_like_nyu(path.parent, [path.name]):
-        return how.open("images.nyu.open_nyu", path)
-    where = _reader(path.name)
+        return ("images.nyu", "open_nyu"), path
+    where = _named(path.name)
     if where is None:  # a file of any name may start with MCAP's magic bytes
         with path.open("rb") as file:
             where = _FILES[".mcap"] if file.read(len(_MCAP)) == _MCAP else None
-    if where is not None:
-        if not path.stat().st_size:
-            raise RecordingError(f"{path} is empty; copy the recording again")
-        return how.open(where, path)
-    why = _NOT_READ.get(path.suffix.lower())
-    raise RecordingError(
-        f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}"
-    )
+    if where is None:
+        why = _NOT_READ.get(path.suffix.lower())
+        raise RecordingError(
+            f"{path} {why}" if why else f"{path} is no recording that can be read; give {_READS}"
+        )
+    if not path.stat().st_size:
+        raise RecordingError(f"{path} is empty; copy the recording again")
+    return where, path
 
 
-def _reader(name: str, files: dict[str, str] = _FILES) -> str | None:
+def _named(name: str, files: dict[str, tuple[str, str]] = _FILES) -> tuple[str, str] | None:
     return next((where for end, where in files.items() if name.lower().endswith(end)), None)
 
 
-def _open_folder(folder: Path, how: _How) -> Recording:
+def _reader_of_folder(folder: Path) -> tuple[tuple[str, str], Path]:
     from liex_lab.recordings.formats.images.nyu import looks_like_nyu
     from liex_lab.recordings.formats.images.raytrix import (
         PROFILE_FILE,
@@ -226,24 +205,24 @@ def _open_folder(folder: Path, how: _How) -> Recording:
     if not inside:
         raise RecordingError(f"{folder} is an empty folder; give {_READS}")
     if any(name in inside for name in ("depth.dat", "depth.avi", "depth.mkv")):
-        return how.open("moseq.open_moseq", folder)
+        return _MOSEQ, folder
     if PROFILE_FILE in inside:
-        return how.open("images.raytrix.open_raytrix", folder)
+        return ("images.raytrix", "open_raytrix"), folder
     if CAMERA_FILE not in inside and looks_like_raytrix(folder, inside):
         raise no_profile_error(folder)
     if looks_like_nyu(folder, inside):
-        return how.open("images.nyu.open_nyu", folder)
+        return ("images.nyu", "open_nyu"), folder
     if "session.json" in inside:
         raise RecordingError(
             f"{folder} is a session, the result of a run; look at it with `liex show`, or give a "
             "recording"
         )
-    if any(Path(name).suffix.lower() in (*_PICTURES, ".jpg", ".jpeg", ".bmp") for name in inside):
-        return how.open("images.folder.open_images", folder)
-    files = [name for name in inside if _reader(name, _ALONE)]
+    if any(Path(name).suffix.lower() in (*_IMAGES, ".jpg", ".jpeg", ".bmp") for name in inside):
+        return _FILES[".png"], folder
+    files = [name for name in inside if _named(name, _ALONE)]
     files = files or [name for name in inside if Path(name).suffix in (".zstd", ".zst")]
     if len(files) == 1:
-        return _open(folder / files[0], how)
+        return _reader_of(folder / files[0])
     offer = files or [f"{name}/" for name in inside if (folder / name).is_dir()]
     raise RecordingError(
         f"{folder} holds no depth images and no depth.dat; "

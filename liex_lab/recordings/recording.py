@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -62,12 +63,9 @@ class SourceFiles:
         """State of each file, sorted: a cheap check for changes; a missing file has size -1."""
         found: Stamp = []
         for path in self.paths:
-            try:
-                now = path.stat()
-            except OSError:
-                found.append([path.name, _GONE, 0])
-            else:
-                found.append([path.name, now.st_size, now.st_mtime_ns])
+            found.append([path.name, _GONE, 0])
+            with suppress(OSError):
+                found[-1][1:] = path.stat().st_size, path.stat().st_mtime_ns
         return sorted(found)
 
     def digest(self, progress: Progress = silent) -> str:
@@ -142,7 +140,14 @@ def file_digest(files: Iterable[Path], progress: Progress = silent) -> str:
     return whole.hexdigest()
 
 
-Times = NDArray[np.int64]
+@contextmanager
+def closing_on_error(opened: Any) -> Iterator[None]:
+    """Close what was opened if the block fails; the recording closes it otherwise."""
+    try:
+        yield
+    except BaseException:
+        opened.close()
+        raise
 
 
 class Recording:
@@ -178,7 +183,7 @@ class Recording:
         name: str,
         format: str,
         camera: Camera,
-        times_ns: Times,
+        times_ns: NDArray[np.int64],
         read: Callable[[int], Depth],
         sources: Sequence[Path] | SourceFiles = (),
         problems: list[str] | None = None,
@@ -437,7 +442,28 @@ class Recording:
             lent: keep this recording open when the result is closed.
         """
         read = self._read
-        return self._through(camera, lambda number: change(read(number)), change, optics, lent)
+        other = Recording(
+            name=self.name,
+            format=self.format,
+            camera=camera,
+            times_ns=self.times_ns.copy(),
+            read=lambda number: change(read(number)),
+            sources=self.files,
+            problems=self.problems,
+            truncated=self.truncated,
+            whole=self._whole_frames,
+            metadata=self.metadata,
+            step_ns=self._step_ns,
+            stored=self._stored,
+            close=None if lent else self.close,
+            faults=self._faults,
+            unpacked=self.unpacked,
+            grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
+            doubts=self.doubts,
+        )
+        other._whole = self._whole or self
+        other.optics = optics
+        return other
 
     def masked(self, region_px: Sequence[Sequence[float]], *, lent: bool = False) -> Recording:
         """The same frames with every pixel outside a polygon unread, to isolate one arena.
@@ -483,40 +509,9 @@ class Recording:
                     kept[number] = depth
             return depth
 
-        other = self._through(self.camera, recall, lambda depth: depth, self.optics, False)
+        other = self.seen_by(self.camera, lambda depth: depth, self.optics)
+        other._read = recall
         other.region_px = self.region_px
-        return other
-
-    def _through(
-        self,
-        camera: Camera,
-        read: Callable[[int], Depth],
-        change: Callable[[Depth], Depth],
-        optics: dict[str, Any],
-        lent: bool,
-    ) -> Recording:
-        """The same frames, read by another function."""
-        other = Recording(
-            name=self.name,
-            format=self.format,
-            camera=camera,
-            times_ns=self.times_ns.copy(),
-            read=read,
-            sources=self.files,
-            problems=self.problems,
-            truncated=self.truncated,
-            whole=self._whole_frames,
-            metadata=self.metadata,
-            step_ns=self._step_ns,
-            stored=self._stored,
-            close=None if lent else self.close,
-            faults=self._faults,
-            unpacked=self.unpacked,
-            grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
-            doubts=self.doubts,
-        )
-        other._whole = self._whole or self
-        other.optics = optics
         return other
 
     def grown(self) -> Recording | None:

@@ -21,7 +21,7 @@ import numpy as np
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.recording import Recording, closing_on_error
 
 _FRAME = struct.Struct("<qqII")  # index, time ns, height, width; then float32 mm, row by row
 _HEAD = struct.Struct("<I")  # length of the greeting, JSON
@@ -152,11 +152,8 @@ def received(host: str, port: int) -> Arriving:
             f"nobody sends frames at {host}:{port} ({error}); start the sender first"
         ) from None
     where = f"{host}:{port}"
-    try:
+    with closing_on_error(link):
         name, camera = _greeting(link, where)
-    except BaseException:
-        link.close()
-        raise
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     return Arriving(name, camera, _stamped(_frames(link, camera, where)))
 

@@ -17,7 +17,7 @@ import shutil
 import sys
 import tempfile
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath, PurePosixPath
@@ -179,7 +179,7 @@ def named_beside(text: str) -> bool:
     return not outside and "\0" not in text
 
 
-# Writing files larger than memory, and detecting full disks.
+# Detecting full disks.
 
 
 _WHY = {
@@ -188,7 +188,6 @@ _WHY = {
     errno.EFBIG: "is full: it takes no file as large as this one",
 }
 _WHY[errno.ENOSPC] = "is full"  # overrides EDQUOT on systems without quotas
-STRETCH = 1 << 26  # bytes of a long file that are in memory at once
 
 
 def is_full(error: BaseException | None) -> bool:
@@ -225,45 +224,6 @@ def why_full(error: OSError, folder: Path | None = None) -> str:
     at = folder or (Path(os.fsdecode(error.filename)) if error.filename else None)
     which = f"the disk that holds {at}" if at else "the disk"
     return f"{which} {_WHY.get(error.errno or 0, 'is full')} ({error.strerror})"
-
-
-def let_go(file: IO[bytes], first: int, last: int) -> None:
-    """Drop part of a file from the page cache; does nothing on systems without `posix_fadvise`.
-
-    Pages that are not on disk yet are queued for writing, and dropped by the next call. Otherwise
-    gigabytes that are read or written once would fill the cache, which costs more than the disk
-    access and evicts the pages of other programs.
-
-    Args:
-        file: the open file, with empty buffers.
-        first: start of the part, bytes.
-        last: end of the part, bytes.
-    """
-    if hasattr(os, "posix_fadvise"):  # Linux
-        with suppress(OSError):  # advisory; some file systems do not support it
-            os.posix_fadvise(file.fileno(), first, last - first, os.POSIX_FADV_DONTNEED)
-
-
-def write_through(parts: Iterable[memoryview], to: IO[bytes]) -> int:
-    """Write parts to a file, forcing them to disk as they come.
-
-    A system that caches writes blocks the writer once too many pages are dirty.
-
-    Args:
-        parts: the content.
-        to: the open, empty file.
-
-    Returns:
-        Number of bytes written.
-    """
-    written = begun = 0
-    for part in parts:
-        written += to.write(part)
-        if written - begun >= STRETCH:
-            to.flush()
-            let_go(to, max(0, begun - STRETCH), written)
-            begun = written
-    return written
 
 
 _AT_ONCE = 8  # files synchronised in parallel; the disk handles them in one go

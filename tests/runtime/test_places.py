@@ -1,17 +1,13 @@
 """A name that came out of a file is one name in the folder that the user named, or is refused."""
 
-import io
 import os
 from pathlib import Path
-from typing import IO
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from liex_lab.errors import PlaceError
-from liex_lab.runtime import durable
 from liex_lab.runtime.durable import (
     inside,
     replacing,
@@ -122,39 +118,3 @@ def test_a_folder_takes_the_place_of_a_folder(tmp_path: Path) -> None:
             (part / "x").write_text(text)
         assert (place / "x").read_text() == text
         assert list(tmp_path.iterdir()) == [place]
-
-
-# What is written through to the disk is what was given, whatever is told to let go meanwhile.
-
-
-@pytest.mark.parametrize("stretch", [1, 1000, 1 << 20])
-def test_parts_are_written_in_their_order_and_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stretch: int
-) -> None:
-    monkeypatch.setattr(durable, "STRETCH", stretch)
-    rng = np.random.default_rng(3)
-    parts = [rng.bytes(int(n)) for n in rng.integers(0, 5000, 100)]
-    path = tmp_path / "written"
-    with path.open("wb") as file:
-        n = durable.write_through((memoryview(part) for part in parts), file)
-    assert path.read_bytes() == b"".join(parts)
-    assert n == path.stat().st_size
-
-
-def test_what_is_let_go_is_read_again(tmp_path: Path) -> None:
-    path = tmp_path / "file"
-    content = np.random.default_rng(4).bytes(1 << 20)
-    path.write_bytes(content)
-    with path.open("rb") as file:
-        assert file.read(1000) == content[:1000]
-        durable.let_go(file, 0, len(content))
-        assert file.read() == content[1000:]
-
-
-def test_a_system_that_cannot_be_told_writes_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(durable, "STRETCH", 10)
-    monkeypatch.delattr(os, "posix_fadvise", raising=False)
-    out: IO[bytes] = io.BytesIO()  # has no number of its own either
-    assert durable.write_through([memoryview(b"abcdefgh")] * 4, out) == 32
-    out.seek(0)
-    assert out.read() == b"abcdefgh" * 4

@@ -14,21 +14,21 @@ Distortion is Brown-Conrady with eight coefficients (ROS: rational_polynomial).
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 import shutil
 import tarfile
 import zlib
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, suppress
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePosixPath
 from threading import Lock
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
-from isal import igzip_threaded, isal_zlib
+from isal import isal_zlib
 from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
@@ -36,7 +36,7 @@ from liex_lab.optics.camera import KINECT_V2, Camera, Distortion, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate, refuse_infrared
 from liex_lab.recordings.formats.images.files import Size, Stack
 from liex_lab.recordings.frame import unread_where_damaged
-from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.recording import Recording, closing_on_error
 from liex_lab.recordings.timestamp_files import Stamps, read_stamps
 from liex_lab.recordings.timestamps import (
     Times,
@@ -47,7 +47,7 @@ from liex_lab.recordings.timestamps import (
     start_of_day,
     unpaired,
 )
-from liex_lab.runtime.durable import STRETCH, Scratch, is_full, let_go, write_through
+from liex_lab.runtime.durable import Scratch, is_full
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_text
 
@@ -55,11 +55,10 @@ if TYPE_CHECKING:
     from liex_lab.recordings.formats.video import DepthVideo
 
 
-_PACKED = 1 << 18  # packed bytes read at once
-_UNPACKED = 1 << 17  # bytes unpacked at once: an empty image is a thousand times its packed size
-_MOST_TIMES = 200  # compression ratio beyond that: true images have noise
+_PIECE = (
+    1 << 17
+)  # bytes read or unpacked at once: an empty image is a thousand times its packed size
 _GZIP_MAGIC = b"\x1f\x8b"
-Pieces = Generator[bytes | memoryview, None, None]
 
 
 class _Member(tarfile.TarInfo):
@@ -115,8 +114,10 @@ class _ArchiveBytes:
         self._progress = progress
         self.zipped = file.read(2) == _GZIP_MAGIC
         file.seek(0)
-        self.whole = not self.zipped or fast
-        self._coming = self._by_isal() if self.whole else self._by_zlib()
+        self.whole = not self.zipped
+        self._coming = (
+            self._unpacked(fast) if self.zipped else iter(partial(file.read, _PIECE), b"")
+        )
         self._piece = memoryview(b"")  # rest of the last one
         self._n_read = 0
 
@@ -134,57 +135,38 @@ class _ArchiveBytes:
                 return b""
             self._piece = memoryview(piece)
             self._n_read += len(piece)
-            # bytes unpacked at any compression ratio
-            if self._n_read > (1 << 29) and self._n_read > _MOST_TIMES * max(packed, 1):
+            # bytes unpacked at any compression ratio; true images have noise
+            if self._n_read > (1 << 29) and self._n_read > 200 * max(packed, 1):
                 raise RecordingError(
-                    f"the archive unpacks to more than {_MOST_TIMES} times its size, which no "
-                    "recording does; pack the session's folder again"
+                    "the archive unpacks to more than 200 times its size, which no recording does; "
+                    "pack the session's folder again"
                 )
         part = bytes(self._piece[:n])
         self._piece = self._piece[n:]
         return part
 
-    def close(self) -> None:
-        """Stop unpacking."""
-        self._coming.close()
-
-    def _by_isal(self) -> Pieces:
-        """An archive that is whole or not packed; each piece is valid until the next is requested.
-
-        ISA-L unpacks on a separate thread, in parallel to writing.
-        """
-        room = bytearray(_UNPACKED)
-        file: Any = self._file
-        try:
-            if self.zipped:
-                file = igzip_threaded.open(self._file, "rb", block_size=_UNPACKED)
-            while n := file.readinto(room):
-                yield memoryview(room)[:n]
-        except (EOFError, gzip.BadGzipFile, isal_zlib.error) as error:  # type: ignore[misc]
-            raise _Damaged from error
-        finally:
-            if self.zipped:
-                file.close()
-
-    def _by_zlib(self) -> Pieces:
-        """The archive unpacked by zlib, up to the last good byte."""
-        inflate = zlib.decompressobj(31)
-        while packed := self._file.read(_PACKED):
+    def _unpacked(self, fast: bool) -> Iterator[bytes]:
+        """The archive unpacked by ISA-L, or by zlib up to the last good byte."""
+        library: Any = isal_zlib if fast else zlib
+        inflate = library.decompressobj(31)
+        while packed := self._file.read(_PIECE):
             while packed:
                 if inflate.eof:
                     # a gzip file may have several members; anything else after it is
                     # padding
                     if len(packed) < len(_GZIP_MAGIC):
-                        packed += self._file.read(_PACKED)
+                        packed += self._file.read(_PIECE)
                     if not packed.startswith(_GZIP_MAGIC):
                         return
-                    inflate = zlib.decompressobj(31)
-                spare = inflate.copy()
+                    inflate = library.decompressobj(31)
+                spare = inflate if fast else inflate.copy()
                 try:
-                    yield inflate.decompress(packed, _UNPACKED)
-                except zlib.error:  # which withholds the whole piece in which it finds damage
+                    yield inflate.decompress(packed, _PIECE)
+                except library.error as error:
+                    if fast:
+                        raise _Damaged from error
                     self.whole = False
-                    with suppress(zlib.error):
+                    with suppress(zlib.error):  # zlib withholds the whole damaged piece
                         for k in range(len(packed)):
                             yield spare.decompress(packed[k : k + 1])
                     return
@@ -227,12 +209,10 @@ def _unpack(
     files: dict[str, Path] = {}
     names: set[str] = set()
     cut = False
-    with (
-        archive.open("rb") as file,
-        closing(_ArchiveBytes(file, archive.stat().st_size, progress, fast)) as stream,
-    ):
+    with archive.open("rb") as file:
+        stream = _ArchiveBytes(file, archive.stat().st_size, progress, fast)
         try:
-            with tarfile.open(fileobj=stream, mode="r|", tarinfo=_Member, bufsize=_UNPACKED) as tar:  # type: ignore[call-overload]
+            with tarfile.open(fileobj=stream, mode="r|", tarinfo=_Member, bufsize=_PIECE) as tar:  # type: ignore[call-overload]
                 for member in tar:
                     name = PurePosixPath(member.name).name
                     if not member.isfile() or name.startswith("._"):
@@ -256,7 +236,7 @@ def _unpack(
                 ) from None
             cut = True
         # a tar ends before the gzip around it, and only gzip's end shows that it is whole
-        while stream.read(_UNPACKED):
+        while stream.read(_PIECE):
             pass
     cut = cut or not stream.whole
     if cut and fast and stream.zipped:
@@ -296,21 +276,16 @@ def _copy(member: tarfile.TarInfo, to: Path, stream: Any) -> None:
     Raises:
         ReadError: the archive ends before it.
     """
-
-    def parts() -> Iterator[memoryview]:
-        left = member.size
-        while left and (part := stream.read(min(left, _UNPACKED))):
-            left -= len(part)
-            yield memoryview(part)
-
+    left = member.size
     try:
         with to.open("wb") as out:
-            written = write_through(parts(), out)
+            while left and (part := stream.read(min(left, _PIECE))):
+                left -= out.write(part)
     except OSError as error:
         if is_full(error):
             raise _no_room(member, to.parent, "") from None
         raise
-    if written < member.size:
+    if left:
         raise tarfile.ReadError("the archive ends within a file")
 
 
@@ -357,12 +332,12 @@ class Metadata:
         problems: sentences about ignored values.
     """
 
-    size: tuple[int, int] | None
-    dtype: str
-    camera: str | None
-    camera_name: str
-    facts: dict[str, Any]
-    problems: list[str]
+    size: tuple[int, int] | None = None
+    dtype: str = "<u2"
+    camera: str | None = None
+    camera_name: str = ""
+    facts: dict[str, Any] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
 
 
 def read_metadata(path: Path | None, cut: bool) -> Metadata:
@@ -375,9 +350,8 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     Raises:
         RecordingError: the file is not a JSON object, or its DepthResolution is invalid.
     """
-    nothing = Metadata(None, "<u2", None, "", {}, [])
     if path is None:
-        return nothing
+        return Metadata()
     try:
         document = json.loads(read_text(path))
         if not isinstance(document, dict):
@@ -387,7 +361,7 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         RecursionError,
     ) as error:  # broken JSON and broken UTF-8 are both ValueErrors
         if cut:
-            return replace(nothing, problems=[f"{METADATA} is cut short and was not used"])
+            return Metadata(problems=[f"{METADATA} is cut short and was not used"])
         raise RecordingError(
             f"{METADATA} of the session is not JSON ({error}); correct or remove it"
         ) from None
@@ -404,23 +378,17 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         problems.append(
             f"StartTime {stated!r} in {METADATA} is not a time with a zone, so it was not used"
         )
-    little = document.get("IsLittleEndian", True) is not False
-    size = _stated_size(document.get("DepthResolution"))
-    return Metadata(size, "<u2" if little else ">u2", *_stated_camera(document), facts, problems)
-
-
-def _stated_size(value: Any) -> tuple[int, int] | None:
-    if value is None:
-        return None
-    if (
-        isinstance(value, list)
-        and len(value) == 2
-        and all(type(v) is int and 0 < v < 20_000 for v in value)
+    size = document.get("DepthResolution")
+    if size is not None and not (
+        isinstance(size, list)
+        and len(size) == 2
+        and all(type(v) is int and 0 < v < 20_000 for v in size)
     ):
-        return value[0], value[1]
-    raise RecordingError(
-        f"{METADATA} states DepthResolution = {value!r}; it is [width, height] in pixels"
-    )
+        raise RecordingError(
+            f"{METADATA} states DepthResolution = {size!r}; it is [width, height] in pixels"
+        )
+    dtype = ">u2" if document.get("IsLittleEndian", True) is False else "<u2"
+    return Metadata(size and tuple(size), dtype, *_stated_camera(document), facts, problems)
 
 
 def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
@@ -490,7 +458,6 @@ _TYPICAL = (
     0.492,
     0.492,
 )  # cx, cy, fx, fy as shares of the sensor's side; units differ by about 1 %
-_DEPTH_CAMERA = ("CALIBRATION_CameraLocationD0", "CALIBRATION_CameraPurposeDepth")
 
 
 # cx, cy, fx, fy as shares of the sensor's side, and k1 k2 p1 p2 k3 k4 k5 k6
@@ -511,7 +478,8 @@ def read_calibration(data: bytes) -> FactoryLens | None:
         depth = next(
             c
             for c in cameras
-            if c.get("Location") == _DEPTH_CAMERA[0] or c.get("Purpose") == _DEPTH_CAMERA[1]
+            if c.get("Location") == "CALIBRATION_CameraLocationD0"
+            or c.get("Purpose") == "CALIBRATION_CameraPurposeDepth"
         )
         values = [float(value) for value in depth["Intrinsics"]["ModelParameters"]]
     except (ValueError, KeyError, TypeError, AttributeError, StopIteration, RecursionError):
@@ -572,9 +540,7 @@ class RawFrames(Stack):
     a leak.
     """
 
-    def __init__(
-        self, path: Path, size: Size, dtype: str, n: int, truncated: bool, once: bool
-    ) -> None:
+    def __init__(self, path: Path, size: Size, dtype: str, n: int, truncated: bool) -> None:
         """Open the file.
 
         Args:
@@ -583,15 +549,12 @@ class RawFrames(Stack):
             dtype: of the stored values, "<u2" or ">u2".
             n: number of whole frames.
             truncated: True if the file ends in the middle of a frame, or its archive is cut.
-            once: True for a file unpacked for this recording, which is read from front to back.
         """
         super().__init__(size, [True] * n, truncated)
         self._path = path
         self._dtype = dtype
-        self._once = once
         self._file = path.open("rb")
         self._lock = Lock()
-        self._kept_from = 0  # earlier pages may have been released
 
     def read(self, index: int) -> NDArray[Any]:
         """Stored values of one frame, (H, W) 16-bit integers.
@@ -603,11 +566,6 @@ class RawFrames(Stack):
         with self._lock:
             self._file.seek(index * n_bytes)
             raw = self._file.read(n_bytes)
-            end = self._file.tell()
-            # limits what the system caches of the file
-            if self._once and not 0 <= end - self._kept_from < STRETCH:
-                let_go(self._file, min(self._kept_from, end), end)
-                self._kept_from = end
         if len(raw) < n_bytes:
             raise RecordingError(
                 f"{self._path} became shorter while it was read; frame {index} is no longer there"
@@ -643,7 +601,7 @@ def open_moseq(
     if path.suffix.lower() == ".dat":
         refuse_infrared(path, path.stem)
     opened = ExitStack()
-    try:
+    with closing_on_error(opened):
         if path.is_dir() or path.suffix.lower() in (".dat", ".avi", ".mkv"):
             folder = path if path.is_dir() else path.parent
             depths = [folder / name for name in DEPTHS if (folder / name).is_file()]
@@ -673,9 +631,6 @@ def open_moseq(
         session = _Session(path, inside, files, cut, camera, fps, progress)
         name = re.sub(r"\.(tar\.gz|[^.]+)$", "", path.name, flags=re.IGNORECASE)
         return session.open(name, [path], opened, scratch.folder)
-    except BaseException:
-        opened.close()
-        raise
 
 
 class _Session:
@@ -716,7 +671,7 @@ class _Session:
         """
         video: DepthVideo | None = None
         if self.depth.suffix.lower() == ".dat":
-            stack: Stack = self._open_raw(once=unpacked is not None)
+            stack: Stack = self._open_raw()
         else:
             stack = video = self._open_video()
         opened.callback(stack.close)
@@ -758,7 +713,7 @@ class _Session:
             )
         return video
 
-    def _open_raw(self, once: bool) -> RawFrames:
+    def _open_raw(self) -> RawFrames:
         n_bytes = self.depth.stat().st_size
         camera = self.stated_camera if isinstance(self.stated_camera, Camera) else self.camera_file
         stated = (camera.width, camera.height) if camera.width and camera.height else None
@@ -778,7 +733,7 @@ class _Session:
                 "frames can be read"
             )
         cut = bool(left_over) or self.cut
-        return RawFrames(self.depth, (width, height), self.metadata.dtype, n, cut, once)
+        return RawFrames(self.depth, (width, height), self.metadata.dtype, n, cut)
 
     def _guess_size(self, n_bytes: int) -> tuple[int, int]:
         """The size of a Kinect v2; an error if the stamps only match another camera's size."""
@@ -838,8 +793,15 @@ class _Session:
             name = self.stamps.path.name
             known = None if own is None else 1e9 / max(median_step(own.times_ns), 1)
             stamps = self.stamps.times(hz or known, self.problems, self.doubts, _NOMINAL_HZ)
-            if self.cut and 1 < len(stamps) < n:
-                stamps = self._continue(stamps, n)
+            if self.cut and 1 < len(stamps) < n:  # a frame is worth keeping without its exact time
+                step = max(1, median_step(stamps))
+                n_late = n - len(stamps)
+                self.problems.append(
+                    f"the time stamps of the last {n_late} frames are cut off, so these frames "
+                    f"were taken to follow every {step / 1e6:.4g} ms, the median step of those "
+                    "before"
+                )
+                stamps = np.append(stamps, stamps[-1] + step * np.arange(1, n_late + 1))
             if len(stamps) == n or own is None or own.even:
                 extra = len(stamps) - n
                 self.problems += match_counts(n, len(stamps), self.depth.name, name)
@@ -865,14 +827,3 @@ class _Session:
             f"{origin}"
         )
         return from_rate(n, hz or _NOMINAL_HZ)
-
-    def _continue(self, stamps: Times, n: int) -> Times:
-        """Stamps for frames whose own were cut off: a frame is worth keeping without its exact
-        time.
-        """
-        step = max(1, median_step(stamps))
-        self.problems.append(
-            f"the time stamps of the last {n - len(stamps)} frames are cut off, so these frames "
-            f"were taken to follow every {step / 1e6:.4g} ms, the median step of those before"
-        )
-        return np.concatenate([stamps, stamps[-1] + step * np.arange(1, n - len(stamps) + 1)])

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.recordings.camera_file import is_infrared, refuse_infrared
 from liex_lab.recordings.formats.images.files import Stack, not_depth_error, too_large
+from liex_lab.recordings.recording import closing_on_error
 from liex_lab.recordings.timestamps import LIMIT_NS
 from liex_lab.runtime.progress import Progress
 
@@ -254,7 +255,7 @@ class DepthVideo(Stack):
                 "read as one; copy it again, or give another file"
             ) from None
         self._file = path.open("rb", buffering=0)
-        try:
+        with closing_on_error(self._file):
             walk = _Walk(self._file, path.stat().st_size, progress)
             if not is_mkv:
                 walk.avi(number)
@@ -278,9 +279,6 @@ class DepthVideo(Stack):
             self.times_ns = np.array(times, np.int64)
             if not self._dtype:
                 self._start_decoder()
-        except BaseException:
-            self._file.close()
-            raise
 
     def _start_decoder(self) -> None:
         """Find the key frames, and refuse a stream that does not decode to 16-bit grey."""

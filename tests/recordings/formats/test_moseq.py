@@ -193,17 +193,6 @@ def test_what_an_archive_was_unpacked_to_opens_as_the_same_recording(
         assert session.unpacked is None
 
 
-@pytest.mark.parametrize("stretch", [1, 3 * FRAME_BYTES, 1 << 26])
-def test_what_an_archive_was_unpacked_to_is_read_in_any_order_and_again(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stretch: int
-) -> None:
-    monkeypatch.setattr("liex_lab.recordings.formats.moseq.STRETCH", stretch)
-    monkeypatch.setattr("liex_lab.runtime.durable.STRETCH", stretch)
-    with open_recording(write_archive(folder, tmp_path / "s.tar.gz")) as recording:
-        for k in (*range(20), 19, 3, *np.random.default_rng(6).permutation(20), 0, 0):
-            np.testing.assert_array_equal(recording.frame(int(k)).depth, STORED[k])
-
-
 def test_members_may_lie_in_folders_and_a_tar_may_be_unpacked_already(
     folder: Path, tmp_path: Path
 ) -> None:

@@ -32,7 +32,7 @@ from liex_lab.recordings.formats.images.files import (
     read_pclzf_camera,
 )
 from liex_lab.recordings.frame import COLOUR, Depth, Stored, unread_where_damaged
-from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.recording import Recording, closing_on_error
 from liex_lab.recordings.timestamp_files import name_numbers, name_times, read_stamps
 from liex_lab.recordings.timestamps import (
     frame_counts,
@@ -172,7 +172,7 @@ def image_recording(
     decode = decode or camera_toml.decode
     folder = path if path.is_dir() else path.parent
     doubts: list[str] = []
-    try:
+    with closing_on_error(stack):
         the_camera = camera_toml.camera(stack.width, stack.height, camera)
         cut = [i for i, whole in enumerate(stack.whole) if not whole]
         problems = [*camera_toml.problems, *stack.problems]
@@ -183,9 +183,6 @@ def image_recording(
         ]
         kept, times, absolute = _times(folder, files, stack, camera_toml, fps, problems, doubts)
         _refuse_negative(stack, decode, camera_toml)
-    except BaseException:
-        stack.close()
-        raise
     monotone = in_order_of_sensor(times)
     problems += [monotone.problem] if monotone.problem else []
     start = start_of_clock(int(monotone.times_ns[0])) if absolute else None

@@ -45,7 +45,7 @@ from liex_lab.recordings.formats.images.folder import (
     open_stack,
 )
 from liex_lab.recordings.frame import Depth, Stored
-from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.recording import Recording, closing_on_error
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_toml
 
@@ -274,11 +274,8 @@ def open_raytrix(
         stack = open_stack(kind, files, camera_toml, progress)
         camera_toml = _with_lens(camera_toml, profile, stack, path)
         decode = profile.decode
-        try:
+        with closing_on_error(stack):
             _check(stack, profile, path)
-        except BaseException:
-            stack.close()
-            raise
     recording = image_recording(
         "raytrix", folder, files, camera_toml, stack, camera, fps, decode, (path,)
     )

@@ -54,7 +54,7 @@ from liex_lab.recordings.formats.messages.parsers import (
     stated_kind,
 )
 from liex_lab.recordings.frame import PLAUSIBLE_MM, Depth, unread_where_damaged
-from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.recording import Recording, closing_on_error
 from liex_lab.recordings.timestamps import in_order_of_sensor, start_of_clock
 from liex_lab.runtime.progress import Progress
 
@@ -266,11 +266,8 @@ def open_topic(
     Raises:
         RecordingError: there is no depth topic, several to choose from, or the camera is unknown.
     """
-    try:
+    with closing_on_error(file):
         return _open(file, kind, camera, topic, progress, _Found())
-    except BaseException:
-        file.close()
-        raise
 
 
 def _open(
