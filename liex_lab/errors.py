@@ -4,6 +4,7 @@ Each message is one sentence: what was expected, what was found, what to do.
 """
 
 import unicodedata
+from collections.abc import Iterable
 from typing import ClassVar
 
 
@@ -116,6 +117,20 @@ class MisfitError(EstimationError):
 
 class MissingPackageError(LiexError):
     """Raised if a required optional package is not installed."""
+
+
+def did_you_mean(word: object, known: Iterable[str], form: str = "did you mean '{}'? ") -> str:
+    """A hint at the known name that is nearest to a mistyped one; "" if none is near.
+
+    Args:
+        word: what was typed.
+        known: the names.
+        form: the hint, with {} for the name.
+    """
+    import difflib
+
+    near = difflib.get_close_matches(str(word), list(known), 1)
+    return form.format(near[0]) if near else ""
 
 
 def one_line(error: BaseException) -> str:

@@ -36,7 +36,7 @@ from liex_lab.errors import PlanError, RecordingError
 from liex_lab.optics.camera import unusual_centre, unusual_lens
 from liex_lab.plan import Plan
 from liex_lab.plan.study import animal_part, find_subject, letters, same
-from liex_lab.recordings.frame import DepthFrame, FrameRooms
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN, unwritable_times
 from liex_lab.runtime import durable, memory, processes
@@ -133,10 +133,8 @@ def measure_shard(shard: Shard) -> Shard:
     """
     opened = _opened(shard.recording, shard.plan.to_toml(), shard.origin.input_sha256)
     first_ns = int(opened.times_ns[0]) if shard.start else None
-    rooms = FrameRooms()
-    coming = opened.frames(shard.start, shard.stop)
     with shard_writer(shard.folder, shard.origin, first_ns) as add:
-        while frames := rooms.filled(coming, CHUNK):
+        for frames in opened.chunks(CHUNK, shard.start, shard.stop):
             add(frames, shard.tracker.observe(frames))
     return shard
 
@@ -515,12 +513,8 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], Non
 
     Rendered recordings are not read ahead, as rendering takes all cores.
     """
-    if opened.format == "synthetic":
-        yield from opened.chunks(CHUNK, first)
-        return
-    rooms = FrameRooms()
-    frames = opened.frames(first)
-    yield from processes.prefetch(iter(lambda: rooms.filled(frames, CHUNK), []))
+    chunks = opened.chunks(CHUNK, first)
+    yield from chunks if opened.format == "synthetic" else processes.prefetch(chunks)
 
 
 def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:

@@ -7,7 +7,6 @@ only write to disk is Python's, which raises an ordinary error.
 
 from __future__ import annotations
 
-import difflib
 import io
 import json
 import math
@@ -24,7 +23,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 
-from liex_lab.errors import SessionError, how_to_install
+from liex_lab.errors import SessionError, did_you_mean, how_to_install
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
@@ -95,8 +94,7 @@ def export(
                 "`liex_lab.api.export_video` writes a video (on the command line `liex export --to "
                 "video`)"
             )
-        near = difflib.get_close_matches(to, [*TARGETS, *ALIASES, "video"], 1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(to, [*TARGETS, *ALIASES, "video"])
         raise SessionError(
             f"there is no format '{to}' to export to: {hint}known are {', '.join(TARGETS)}, "
             f"{', '.join(ALIASES)} (the same as dlc) and video"

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 
 from pydantic import Field, ValidationError, model_validator
 
-from liex_lab.errors import PlanError
+from liex_lab.errors import PlanError, did_you_mean
 from liex_lab.plan.sections import (
     Actions,
     AnimalSettings,
@@ -138,11 +138,9 @@ class Plan(SettingsTable):
             path = Path(plan)
         if not path.is_file():
             known = known_plans()
-            near = difflib.get_close_matches(str(plan), known, 1)
-            hint = f"did you mean '{near[0]}'? " if near else ""
             raise PlanError(
-                f"there is no plan '{plan}': {hint}bundled are: {', '.join(known) or 'none'}, or "
-                "give the path of a .toml file"
+                f"there is no plan '{plan}': {did_you_mean(plan, known)}bundled are: "
+                f"{', '.join(known) or 'none'}, or give the path of a .toml file"
             )
         try:
             text = read_text(path)

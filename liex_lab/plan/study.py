@@ -6,7 +6,6 @@ recordings, plans and results are inside the folder of the file.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import re
 import unicodedata
@@ -21,7 +20,7 @@ from urllib.parse import parse_qsl
 
 from pydantic import Field, ValidationError, model_validator
 
-from liex_lab.errors import PlanError, StudyError
+from liex_lab.errors import PlanError, StudyError, did_you_mean
 from liex_lab.plan import Plan, known_plans
 from liex_lab.plan.sections import ArenaPlace, SettingsTable, first_twice
 from liex_lab.runtime import durable, text_files
@@ -391,8 +390,7 @@ def _sentence(error: ValidationError) -> str:
     key = str(first["loc"][-1]) if first["loc"] else ""
     if first["type"] == "extra_forbidden":
         model = _MODELS.get(str(first["loc"][0]), StudyTable)
-        near = difflib.get_close_matches(key, model.model_fields, 1)
-        hint = f", did you mean {near[0]}" if near else ""
+        hint = did_you_mean(key, model.model_fields, ", did you mean {}")
         return f"{where} is not known here{hint}; correct or remove it{more}"
     if first["type"] == "value_error":
         return first["msg"].removeprefix("Value error, ") + more

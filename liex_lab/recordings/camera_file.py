@@ -6,7 +6,6 @@ reported with the closest valid one. Also: infrared images, recognised by their 
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Callable
@@ -14,7 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from liex_lab.errors import LiexError, RecordingError, UnknownCameraError, printable
+from liex_lab.errors import (
+    LiexError,
+    RecordingError,
+    UnknownCameraError,
+    did_you_mean,
+    printable,
+)
 from liex_lab.optics.camera import Camera, Distortion, Lens
 from liex_lab.recordings.frame import ENCODINGS, Depth, Stored, decode
 from liex_lab.recordings.timestamp_files import UNITS
@@ -150,8 +155,7 @@ class CameraFile:
                 table |= document[name]
         problems = []
         for key in (key for key in table if key not in _KEYS):
-            near = difflib.get_close_matches(key, _KEYS, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(key, _KEYS, "; did you mean '{}'?")
             problems.append(f"{path.name} has a key {key!r} that means nothing here{hint}")
         return _from_table(path, table, tuple(problems))
 

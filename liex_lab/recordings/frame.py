@@ -10,10 +10,8 @@ Depth is float32, measured along the optical axis (z of the camera frame, not ra
 0 means no reading. On writing, steps are exact or nearest.
 """
 
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -63,79 +61,6 @@ def marked(frames: Iterable[DepthFrame], before: Depth | None = None) -> Iterato
         )
         before = frame.depth
         yield replace(frame, repeats=repeats)
-
-
-class FrameRooms:
-    """Contiguous buffers for frames, reused once no frame refers to them.
-
-    The system has to blank new memory first, which takes longer than copying an image into memory
-    that was used before.
-    """
-
-    def __init__(self) -> None:
-        self._rooms: list[Depth] = []
-
-    def filled(self, frames: Iterable[DepthFrame], n_frames: int) -> list[DepthFrame]:
-        """The same frames, with the depth of each copied into one array as it arrives.
-
-        `stacked` then needs no copy.
-
-        Args:
-            frames: of one size.
-            n_frames: maximum number of frames.
-        """
-        taken: list[DepthFrame] = []
-        room = None
-        for frame in islice(frames, n_frames):
-            if room is None:
-                room = self._free((n_frames, *frame.depth.shape))
-            depth = room[len(taken)]
-            depth[...] = frame.depth
-            taken.append(replace(frame, depth=depth))
-        return taken
-
-    def _free(self, shape: tuple[int, ...]) -> Depth:
-        """A buffer of this shape that no frame refers to."""
-        for k in range(len(self._rooms)):
-            if self._rooms[k].shape == shape and _references(self._rooms, k) == _UNUSED:
-                return self._rooms[k]
-        alike = [room for room in self._rooms if room.shape == shape]
-        # six are kept: being filled, waiting, processed (two at once), written
-        self._rooms = [*alike[-5:], np.empty(shape, np.float32)]
-        return self._rooms[-1]
-
-
-def _references(rooms: list[Depth], k: int) -> int:
-    """Reference count of buffer k of a list: the list itself, and frames in the buffer."""
-    return sys.getrefcount(rooms[k])
-
-
-_UNUSED = _references([np.empty(0, np.float32)], 0)  # referred to by its list only
-
-
-def stacked(frames: Sequence[DepthFrame]) -> NDArray[np.float32]:
-    """Depth of frames as one array, without a copy if they share a buffer of `FrameRooms` in order.
-
-    Args:
-        frames: at least one, of one size.
-
-    Returns:
-        (n, H, W) float32 mm; do not write to it.
-    """
-    room = frames[0].depth.base
-    if (
-        isinstance(room, np.ndarray)
-        and room.ndim == 3
-        and len(room) >= len(frames)
-        and room.shape[1:] == frames[0].depth.shape
-        and room.dtype == np.float32
-        and all(
-            frame.depth.base is room and frame.depth.ctypes.data == row.ctypes.data
-            for frame, row in zip(frames, room, strict=False)
-        )
-    ):
-        return room[: len(frames)]
-    return np.stack([frame.depth for frame in frames])
 
 
 def unread_where_damaged(

@@ -360,12 +360,15 @@ class Recording:
     def __iter__(self) -> Iterator[DepthFrame]:
         return self.frames()
 
-    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+    def chunks(
+        self, n_frames: int, first: int = 0, stop: int | None = None
+    ) -> Iterator[list[DepthFrame]]:
         """Consecutive frames in lists of equal length; one list is in memory at a time.
 
         Args:
             n_frames: frames per list; the last list may be shorter.
             first: row of the first frame.
+            stop: row after the last one; None for the end of the recording.
 
         Yields:
             Lists of decoded frames, in order.
@@ -375,7 +378,7 @@ class Recording:
         """
         if n_frames < 1:
             raise ValueError(f"a chunk has at least one frame, got {n_frames}")
-        frames = self.frames(first)
+        frames = self.frames(first, stop)
         yield from iter(lambda: list(islice(frames, n_frames)), [])
 
     def __getitem__(self, part: slice) -> Recording:

@@ -226,9 +226,6 @@ def why_full(error: OSError, folder: Path | None = None) -> str:
     return f"{which} {_WHY.get(error.errno or 0, 'is full')} ({error.strerror})"
 
 
-_AT_ONCE = 8  # files synchronised in parallel; the disk handles them in one go
-
-
 def sync_tree(folder: Path) -> None:
     """Synchronise all regular files in a folder, then its subfolders and the folder itself.
 
@@ -393,7 +390,7 @@ def _remove(path: Path) -> None:
 
 def _side_by_side(sync: Callable[[Path], None], paths: Sequence[Path]) -> None:
     """Synchronise several files or folders in parallel; raises the first error without waiting."""
-    pool = ThreadPoolExecutor(_AT_ONCE)
+    pool = ThreadPoolExecutor(8)  # the disk handles them in one go
     try:
         for done in [pool.submit(sync, path) for path in paths]:
             done.result()
@@ -514,14 +511,10 @@ def remove_stale() -> None:
     """
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         with suppress(OSError, LiexError):
-            if folder.is_symlink() or not _own(folder):
+            foreign = hasattr(os, "getuid") and folder.stat().st_uid != os.getuid()
+            if folder.is_symlink() or foreign:
                 continue
             held = take_lock(folder / _LOCK)
             if held is not None:
                 held.close()
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-def _own(folder: Path) -> bool:
-    """Whether this account owns a folder."""
-    return not hasattr(os, "getuid") or folder.stat().st_uid == os.getuid()

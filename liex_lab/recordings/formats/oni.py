@@ -29,7 +29,7 @@ from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
 from liex_lab.recordings.depth_kernels import WORST_BYTES_A_PIXEL, unpack_16z
 from liex_lab.recordings.frame import Depth, depth_mm, unread_where_damaged
-from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.recording import Recording, closing_on_error
 from liex_lab.recordings.timestamps import (
     Times,
     from_rate,
@@ -50,48 +50,32 @@ _FRAME_FIELDS = struct.Struct("<QI")  # time in µs, number of the frame, counte
 _NODE_FIELDS = struct.Struct("<i4s")  # kind, codec
 _UNKNOWN_COUNT = 0xFFFFFFFF
 
-MODE = "xnMapOutputMode"
-CROPPING = "xnCropping"
-MIRROR = "xnMirror"
-UNIT = "oniPixelFormat"
-FIELD_OF_VIEW = "xnFOV"
-OLD_LENS = "xnRealWorldTranslationData"
-PLANE_DISTANCE = "ZPD"
-PLANE_PIXEL = "ZPPS"
-# fx, fy, cx, cy: written by earlier versions of liex, as the format has no optical axis
-INTRINSICS = "liexIntrinsics"
 _USED = (
-    MODE,
-    CROPPING,
-    MIRROR,
-    UNIT,
-    FIELD_OF_VIEW,
-    OLD_LENS,
-    PLANE_DISTANCE,
-    PLANE_PIXEL,
-    INTRINSICS,
+    "xnMapOutputMode",
+    "xnCropping",
+    "xnMirror",
+    "oniPixelFormat",
+    "xnFOV",
+    "xnRealWorldTranslationData",
+    "ZPD",
+    "ZPPS",
+    # fx, fy, cx, cy: written by earlier versions of liex, as the format has no optical axis
+    "liexIntrinsics",
 )
 
 
 class Record(NamedTuple):
-    """One record; `size` is that of its header and fields, of which up to 4096 bytes are read."""
+    """One record: its position and those of its payload and of the next record, bytes.
+
+    Of its header's fields, up to 4096 bytes are read.
+    """
 
     at: int
     kind: int
     node: int
-    size: int
-    payload_size: int
+    payload: int
+    end: int
     fields: bytes
-
-    @property
-    def payload(self) -> int:
-        """Position of its payload in the file, bytes."""
-        return self.at + self.size
-
-    @property
-    def end(self) -> int:
-        """Position of the next record, bytes."""
-        return self.payload + self.payload_size
 
 
 class OniFile:
@@ -150,8 +134,7 @@ class OniFile:
                 self.whole = False
                 # its size is damaged, not the next record
                 if following is not None and following.at < record.end:
-                    size = max(0, following.at - record.payload)
-                    record = record._replace(payload_size=size)
+                    record = record._replace(end=max(record.payload, following.at))
             yield record
             if record.end >> 20 != reported:
                 reported = record.end >> 20
@@ -173,7 +156,8 @@ class OniFile:
         if n_fields > len(raw) - header.size:
             # bytes read of names and numbers
             raw = self.read(at, header.size + min(n_fields, 4096))
-        return Record(at, kind, node, size, payload_size, raw[header.size : size])
+        fields = raw[header.size : size]
+        return Record(at, kind, node, at + size, at + size + payload_size, fields)
 
     def _search(self, start: int) -> Record | None:
         """The first record from a position that is within the file."""
@@ -239,7 +223,8 @@ class DepthNode:
         if self.format_now is None:
             self.format_now = self.formats.setdefault(self._format(), len(self.formats))
         time_us, _ = _FRAME_FIELDS.unpack(record.fields)
-        self.entries.extend((time_us, record.payload, record.payload_size, self.format_now))
+        n_bytes = record.end - record.payload
+        self.entries.extend((time_us, record.payload, n_bytes, self.format_now))
 
     def number(self, name: str) -> int | None:
         """Value of an integer property; None if absent."""
@@ -252,16 +237,16 @@ class DepthNode:
         return struct.unpack(layout, value) if len(value) == struct.calcsize(layout) else None
 
     def _format(self) -> FrameFormat | None:
-        mode = self.numbers(MODE, "<III")
+        mode = self.numbers("xnMapOutputMode", "<III")
         if mode is None:
             return None
         width, height, fps = mode
-        cropped, *crop = self.numbers(CROPPING, "<IHHHH") or (0,)
+        cropped, *crop = self.numbers("xnCropping", "<IHHHH") or (0,)
         part = (crop[0], crop[1], crop[2], crop[3]) if cropped else (0, 0, width, height)
-        unit = self.number(UNIT)
+        unit = self.number("oniPixelFormat")
         # the pixel format if none is stated
         constant = (width, height, 100 if unit is None else unit)
-        return FrameFormat(constant, part, bool(self.number(MIRROR)), fps)
+        return FrameFormat(constant, part, bool(self.number("xnMirror")), fps)
 
 
 def index_file(file: OniFile, progress: Progress) -> tuple[list[DepthNode], set[str]]:
@@ -296,7 +281,7 @@ def index_file(file: OniFile, progress: Progress) -> tuple[list[DepthNode], set[
                 if name in _USED and len(value := rest[4 : 4 + size]) <= 64:
                     node.properties[name] = value
                     node.format_now = None
-            elif record.kind == _FRAME and record.payload_size:
+            elif record.kind == _FRAME and record.end > record.payload:
                 node.add(record)
         except struct.error:
             sound = False
@@ -388,46 +373,37 @@ def open_oni(
         RecordingError: there are no depth frames, they cannot be decoded, or the camera is unknown.
     """
     # unbuffered: every read follows a seek, and a buffer would read 8 kB for each 40 bytes
-    file = path.open("rb", buffering=0)
-    try:
-        return _open(path, file, camera, fps, progress)
-    except BaseException:
-        file.close()
-        raise
-
-
-def _open(
-    path: Path, raw: IO[bytes], camera: Lens | None, fps: float | None, progress: Progress
-) -> Recording:
-    file = OniFile(path, raw)
-    nodes, others = index_file(file, progress)
-    problems: list[str] = []
-    node = _choose(path, file, nodes, others, problems)
-    form = _format(path, node, problems)
-    width, height, _ = form.constant
-    n = len(node.frames)
-    whole = file.whole and (node.n_stated is None or node.n_stated <= n)
-    if node.n_stated not in (None, n):
-        problems.append(
-            f"{path.name} promises {node.n_stated} frames of {node.name}, and {n} are in it"
-        )
-    if not whole:
-        problems.append(
-            f"{path.name} is cut or damaged; {n} whole frame{'' if n == 1 else 's'} can be read "
-            "from it"
-        )
-    camera_file = CameraFile.read(path.parent / CAMERA_FILE)
-    problems += camera_file.problems
-    the_camera = _camera(path, node, form, camera_file, camera, problems)
-    monotone = in_order_of_sensor(_times(node, form, fps, problems))
-    problems += [monotone.problem] if monotone.problem else []
-    read = _frame_reader(file, node, form, camera_file)
-    probed = np.linspace(0, n - 1, min(n, 5)).astype(int).tolist()
-    if all(isinstance(read(i), str) for i in probed):
-        raise RecordingError(
-            f"{path} states images of {width} x {height} pixels, but its frames do not "
-            "unpack to that; it is damaged, so copy it again"
-        )
+    raw = path.open("rb", buffering=0)
+    with closing_on_error(raw):
+        file = OniFile(path, raw)
+        nodes, others = index_file(file, progress)
+        problems: list[str] = []
+        node = _choose(path, file, nodes, others, problems)
+        form = _format(path, node, problems)
+        width, height, _ = form.constant
+        n = len(node.frames)
+        whole = file.whole and (node.n_stated is None or node.n_stated <= n)
+        if node.n_stated not in (None, n):
+            problems.append(
+                f"{path.name} promises {node.n_stated} frames of {node.name}, and {n} are in it"
+            )
+        if not whole:
+            problems.append(
+                f"{path.name} is cut or damaged; {n} whole frame{'' if n == 1 else 's'} "
+                "can be read from it"
+            )
+        camera_file = CameraFile.read(path.parent / CAMERA_FILE)
+        problems += camera_file.problems
+        the_camera = _camera(path, node, form, camera_file, camera, problems)
+        monotone = in_order_of_sensor(_times(node, form, fps, problems))
+        problems += [monotone.problem] if monotone.problem else []
+        read = _frame_reader(file, node, form, camera_file)
+        probed = np.linspace(0, n - 1, min(n, 5)).astype(int).tolist()
+        if all(isinstance(read(i), str) for i in probed):
+            raise RecordingError(
+                f"{path} states images of {width} x {height} pixels, but its frames do not "
+                "unpack to that; it is damaged, so copy it again"
+            )
     start = start_of_clock(int(monotone.times_ns[0]))
     return Recording(
         name=path.resolve().stem,
@@ -557,9 +533,9 @@ def _camera(
     # calibration
     if stated is not None or camera_file.intrinsics:
         return camera_file.camera(width, height, stated)
-    ours = node.numbers(INTRINSICS, "<dddd")
+    ours = node.numbers("liexIntrinsics", "<dddd")
     if ours is not None and np.isfinite(ours).all() and _can_be(ours[:2], (width, height)):
-        source = f"intrinsics in the .oni file ({INTRINSICS})"
+        source = "intrinsics in the .oni file (liexIntrinsics)"
         return Camera(ours[0], ours[1], ours[2], ours[3], width, height, source=source)
     focal, source = _stated_focal(node, (width, height), problems)
     if focal is None and (width, height) in (
@@ -591,15 +567,17 @@ def _stated_focal(
 ) -> tuple[tuple[float, float] | None, str]:
     """Focal lengths (fx, fy) px and their source; (None, "") without plausible ones in the file."""
     found: list[tuple[tuple[float, float], str]] = []
-    view = node.numbers(FIELD_OF_VIEW, "<dd")
+    view = node.numbers("xnFOV", "<dd")
     if view is not None and all(0 < angle < math.pi for angle in view):
         fx, fy = (n / 2 / math.tan(angle / 2) for n, angle in zip(size, view, strict=True))
         found.append(((fx, fy), "field of view in the .oni file (xnFOV)"))
-    if (plane := node.numbers(OLD_LENS, "<ddd")) is not None and plane[1] * plane[2] > 0:
+    if (plane := node.numbers("xnRealWorldTranslationData", "<ddd")) is not None and plane[
+        1
+    ] * plane[2] > 0:
         focal = plane[0] / (plane[1] * plane[2])
-        found.append(((focal, focal), f"lens in the .oni file ({OLD_LENS})"))
-    distance = node.number(PLANE_DISTANCE)
-    pixel = node.numbers(PLANE_PIXEL, "<d")
+        found.append(((focal, focal), "lens in the .oni file (xnRealWorldTranslationData)"))
+    distance = node.number("ZPD")
+    pixel = node.numbers("ZPPS", "<d")
     if distance is not None and pixel is not None and pixel[0] > 0:
         # columns of the sensor for which ZPPS states the pixel size
         focal = distance / pixel[0] * size[0] / 1280

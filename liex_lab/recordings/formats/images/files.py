@@ -22,7 +22,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,14 +133,12 @@ def open_files(
     for path in files:
         found.append(probe(path))
         progress(len(found), len(files), "looking at the images")
-    sizes = {size: path.name for path, size in zip(files, found, strict=True) if _is_size(size)}
+    sizes = {
+        size: path.name for path, size in zip(files, found, strict=True) if isinstance(size, tuple)
+    }
     why = next((error for error in found if isinstance(error, RecordingError)), None)
     size = _common_size(sizes, files, kind, why)
-    return FileStack(files, size, [_is_size(one) for one in found], decode)
-
-
-def _is_size(found: Probe) -> TypeGuard[Size]:
-    return isinstance(found, tuple)
+    return FileStack(files, size, [isinstance(one, tuple) for one in found], decode)
 
 
 def _common_size(
@@ -202,7 +200,7 @@ def not_depth_error(where: str, found: str, width: int, height: int) -> Recordin
 
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_END = struct.pack(">I", 0) + b"IEND\xaeB`\x82"  # the last chunk: no data, its name, its CRC
+_END = b"\0\0\0\0IEND\xaeB`\x82"  # the last chunk: no data, its name, its CRC
 _HEAD_BYTES = 33  # signature and the whole header chunk with its CRC
 _COLOURS = {
     0: "grey",
@@ -413,20 +411,12 @@ _INTRINSICS = {  # element of <depth>: our name
 }
 
 
-def open_pclzfs(files: list[Path], progress: Progress) -> FileStack:
-    """Open PCLZF images: header and length of every file are checked, and none is decoded.
-
-    Args:
-        files: the images, in order.
-        progress: counts the probed files.
+def probe_pclzf(path: Path) -> Probe:
+    """Check header and length of a PCLZF file.
 
     Raises:
-        RecordingError: none is whole, one is colour, or their sizes differ.
+        RecordingError: it is in colour.
     """
-    return open_files(files, "PCLZF", _probe_pclzf, _decode_pclzf, progress)
-
-
-def _probe_pclzf(path: Path) -> Probe:
     with path.open("rb") as file:
         head = file.read(_PCLZF_HEADER.size)
     if not head.startswith(b"PCLZF"[: len(head)]):
@@ -445,7 +435,8 @@ def _probe_pclzf(path: Path) -> Probe:
     return (width, height) if fits and there else None
 
 
-def _decode_pclzf(path: Path) -> NDArray[np.uint16] | None:
+def decode_pclzf(path: Path) -> NDArray[np.uint16] | None:
+    """Stored values (H, W) of a file; None if it is damaged."""
     from liex_lab.recordings.depth_kernels import unpack_lzf
 
     with path.open("rb") as file:

@@ -25,10 +25,12 @@ from liex_lab.recordings.camera_file import (
 )
 from liex_lab.recordings.formats.images.files import (
     Stack,
-    open_pclzfs,
+    decode_pclzf,
+    open_files,
     open_pgms,
     open_pngs,
     open_tiffs,
+    probe_pclzf,
     read_pclzf_camera,
 )
 from liex_lab.recordings.frame import COLOUR, Depth, Stored, unread_where_damaged
@@ -293,7 +295,9 @@ def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: 
         )
     if kind == "PGM":
         return open_pgms(files, progress, camera_file.byte_order)
-    return open_pclzfs(files, progress) if kind == "PCLZF" else open_tiffs(files, progress)
+    if kind == "PCLZF":
+        return open_files(files, kind, probe_pclzf, decode_pclzf, progress)
+    return open_tiffs(files, progress)
 
 
 def _refuse_negative(

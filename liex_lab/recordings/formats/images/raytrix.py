@@ -13,7 +13,6 @@ depth images by projection into a pinhole camera with a z-buffer.
 
 from __future__ import annotations
 
-import difflib
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from liex_lab.errors import RecordingError
+from liex_lab.errors import RecordingError, did_you_mean
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
 from liex_lab.recordings.formats.images.files import (
@@ -211,8 +210,7 @@ def read_profile(path: Path) -> Profile:
     known = tuple(key for key in Profile.model_fields if key != "name")
     for key in table:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else "remove it"
+            hint = did_you_mean(key, known, "did you mean '{}'?") or "remove it"
             raise RecordingError(f"{path} has a key {key!r} that no profile has; {hint}")
     try:
         return Profile(**{"name": name or path.name, **shipped.get(str(name), {}), **table})

@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import struct
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -34,7 +34,6 @@ from liex_lab.recordings.formats.messages.messages import (
     Channel,
     DamagedChunk,
     DamagedMessage,
-    DepthMessage,
     Envelope,
     IndexedMessages,
     MessageFile,
@@ -177,73 +176,65 @@ class _Found:
         return [f"{printable(topic)}: {printable(why, 200)}" for topic, why in whys.items()]
 
 
-@dataclass
-class _TopicFrames:
-    """Images of one topic, read from the file one at a time.
+def _frame_reader(
+    file: MessageFile,
+    topic: _Topic,
+    places: NDArray[np.int64],
+    camera: Camera,
+    step_mm: float,
+    unread: Sequence[float],
+) -> Callable[..., Depth | str]:
+    """The function that reads depth of one image of a topic, or what is wrong with it.
 
-    Attributes:
+    Args:
         file: the open file.
         topic: the topic.
         places: (n, 3) chunk, offset and length of each image's message.
         camera: the camera of the recording.
         step_mm: mm per step of 16-bit depth.
         unread: values that mean "no reading", from a camera.toml.
-        lock: held while the file is read.
     """
+    lock = Lock()
 
-    file: MessageFile
-    topic: _Topic
-    places: NDArray[np.int64]
-    camera: Camera
-    step_mm: float
-    unread: Sequence[float]
-    lock: Any = field(default_factory=Lock)
-
-    def read(self, number: int, scale: float = 1.0) -> Depth | str:
-        """Depth of one image, or what is wrong with it.
-
-        Args:
-            number: index of the image, in order of logging.
-            scale: factor on the depth.
-
-        Returns:
-            (H, W) float32 mm, 0 where unread.
-        """
-        with self.lock:
-            data = self.file.read(MessagePlace(*self.places[number].tolist()))
+    def read(number: int, scale: float = 1.0) -> Depth | str:
+        """Depth (H, W) float32 mm of the image `number`, in order of logging, times `scale`."""
+        with lock:
+            data = file.read(MessagePlace(*places[number].tolist()))
         try:
-            message = self.topic.parse(data)
+            message: Any = topic.parse(data)
+            why = stated_kind(message)
         except _DAMAGE as error:
-            if self.file.parsed:
-                return self._wrong(str(error))
-            raise RecordingError(
-                f"{self.file.path} is damaged ({error}); copy it again, or go on with what is "
-                "whole by adding --set recording.accept_truncated=true"
-            ) from None
-        assert isinstance(message, DepthMessage)
-        depth = None
-        with suppress(*_DAMAGE):
-            depth = decode_message(message, self.camera, self.step_mm, scale, self.unread)
-        return self._wrong(stated_kind(message)) if depth is None else depth
-
-    def _wrong(self, why: str) -> str:
+            if not file.parsed:
+                raise RecordingError(
+                    f"{file.path} is damaged ({error}); copy it again, or go on with what is whole "
+                    "by adding --set recording.accept_truncated=true"
+                ) from None
+            why = str(error)
+        else:
+            with suppress(*_DAMAGE):
+                depth = decode_message(message, camera, step_mm, scale, unread)
+                if depth is not None:
+                    return depth
         return (
-            f" of {printable(self.topic.name)} is damaged or not of {self.camera.width} x "
-            f"{self.camera.height} pixels ({printable(why)})"
+            f" of {printable(topic.name)} is damaged or not of {camera.width} x {camera.height} "
+            f"pixels ({printable(why)})"
         )
 
-    def plausible(self, factors: Sequence[float]) -> float:
-        """The first factor on depth that suits a camera above an animal.
+    return read
 
-        Args:
-            factors: in order; the last one if none is plausible, and the first one if all are equal
-                or there are no readings.
-        """
-        probed = (0, len(self.places) // 2) if len(set(factors)) > 1 else ()
-        readings = (one[one > 0] for one in map(self.read, probed) if not isinstance(one, str))
-        median_mm = next((float(np.median(some)) for some in readings if some.size), 0.0)
-        good = [f for f in factors if PLAUSIBLE_MM[0] <= f * median_mm <= PLAUSIBLE_MM[1]]
-        return [*good, factors[-1 if median_mm else 0]][0]
+
+def _plausible(
+    read: Callable[[int], Depth | str], n_images: int, factors: Sequence[float]
+) -> float:
+    """The first factor on depth that suits a camera above an animal.
+
+    The last one if none is plausible, and the first one if all are equal or there are no readings.
+    """
+    probed = (0, n_images // 2) if len(set(factors)) > 1 else ()
+    readings = (one[one > 0] for one in map(read, probed) if not isinstance(one, str))
+    median_mm = next((float(np.median(some)) for some in readings if some.size), 0.0)
+    good = [f for f in factors if PLAUSIBLE_MM[0] <= f * median_mm <= PLAUSIBLE_MM[1]]
+    return [*good, factors[-1 if median_mm else 0]][0]
 
 
 def open_topic(
@@ -319,13 +310,12 @@ def _open(
     stated_mm = found.stated.step_mm(chosen.name, camera_file.states_unit, problems, doubts)
     step_mm = (stated_mm or 1.0) * packed.step_mm
     places = rows[monotone.order, 3:]
-    frames = _TopicFrames(file, chosen, places, the_camera, step_mm, camera_file.unread)
+    read = _frame_reader(file, chosen, places, the_camera, step_mm, camera_file.unread)
     unit_mm = camera_file.unit_mm
     literal = unit_mm / (1000.0 if chosen.metric else step_mm)
     known = camera_file.states_unit and bool(file.notes or stated_mm)
-    scale = frames.plausible(
-        [1.0 if known else unit_mm, literal] if camera_file.states_unit else [unit_mm]
-    )
+    factors = [1.0 if known else unit_mm, literal] if camera_file.states_unit else [unit_mm]
+    scale = _plausible(read, len(places), factors)
     if known and scale != literal:
         problems.append(
             f"unit_mm = {unit_mm:g} in camera.toml is not used, for the recording states its unit"
@@ -337,7 +327,7 @@ def _open(
         format=kind,
         camera=the_camera,
         times_ns=monotone.times_ns,
-        read=unread_where_damaged(partial(frames.read, scale=scale), shape, problems),
+        read=unread_where_damaged(partial(read, scale=scale), shape, problems),
         sources=[path],
         problems=problems,
         truncated=not file.whole,
