@@ -61,13 +61,13 @@ def reading(read: Any, text: str) -> None:
         check(lambda: read(path))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(text=_TEXTS)
 def test_any_text_instead_of_zones(text: str) -> None:
     reading(read_zones, text)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(text=_TEXTS)
 def test_any_text_instead_of_a_slurm_file(text: str) -> None:
     reading(SlurmTable.load, text)
@@ -80,7 +80,7 @@ def skeleton_of(table: dict[str, Any]) -> None:
     assert skeleton.length > 0
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(data=st.data())
 def test_any_value_anywhere_in_a_skeleton(data: st.DataObject) -> None:
     table = copy.deepcopy(_MOUSE)
@@ -91,7 +91,7 @@ def test_any_value_anywhere_in_a_skeleton(data: st.DataObject) -> None:
     check(lambda: skeleton_of(table))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(joints=ANYTHING, surface=ANYTHING, view=ANYTHING)
 def test_any_table_instead_of_a_skeleton(joints: Any, surface: Any, view: Any) -> None:
     check(lambda: skeleton_of({"name": "x", "joints": joints, "surface": surface, "view": view}))

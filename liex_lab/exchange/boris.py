@@ -123,7 +123,6 @@ def _date(session: Session) -> str:
 
 
 _STATE = "State event"
-_MOST_BYTES = 1 << 28  # unpacked
 
 
 def read_boris_project(path: str | Path) -> dict[str, Any]:
@@ -138,7 +137,12 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
     source = Path(path)
     try:
         raw = source.read_bytes()
-        document = json.loads(decoded(_unpacked(raw) if raw[:2] == b"\x1f\x8b" else raw))
+        if raw[:2] == b"\x1f\x8b":
+            with gzip.open(io.BytesIO(raw)) as file:
+                raw = file.read((1 << 28) + 1)
+            if len(raw) > 1 << 28:
+                raise ValueError("it unpacks to more than 256 MB")
+        document = json.loads(decoded(raw))
     except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
         raise LiexError(
             f"{source} should be a BORIS project (JSON), but: {one_line(error)}"
@@ -181,9 +185,13 @@ def boris_labels(path: str | Path) -> pd.DataFrame:
             raise LiexError(
                 f"{path}: the observation {name} is not an object; save it from BORIS again"
             )
-        rows += _pairs(
-            observation.get("events", []), points, name, _offset(observation, name, path), path
-        )
+        try:
+            offset = float(observation.get("time offset") or 0.0)
+        except (TypeError, ValueError, OverflowError):
+            raise LiexError(
+                f"{path}: the observation {name} has a time offset that is no number; correct it"
+            ) from None
+        rows += _pairs(observation.get("events", []), points, name, offset, path)
     columns = ["session_id", "individual", "action", "start_s", "stop_s", "source"]
     return checked(pd.DataFrame(rows, columns=columns), str(path))
 
@@ -224,25 +232,6 @@ def is_boris_export(path: str | Path) -> bool:
     except ValueError:
         return False
     return "".join(lines[:2]).startswith(("Observation id", '"Observation id"'))
-
-
-def _unpacked(raw: bytes) -> bytes:
-    """The uncompressed content; raises ValueError if it has more than 256 MB."""
-    with gzip.open(io.BytesIO(raw)) as file:
-        text = file.read(_MOST_BYTES + 1)
-    if len(text) > _MOST_BYTES:
-        raise ValueError(f"it unpacks to more than {_MOST_BYTES >> 20} MB")
-    return text
-
-
-def _offset(observation: dict[str, Any], name: str, path: str | Path) -> float:
-    """The observation's time offset, s."""
-    try:
-        return float(observation.get("time offset") or 0.0)
-    except (TypeError, ValueError, OverflowError):
-        raise LiexError(
-            f"{path}: the observation {name} has a time offset that is no number; correct it"
-        ) from None
 
 
 def _pairs(

@@ -39,7 +39,6 @@ from liex_lab.plan.sections import (
 from liex_lab.runtime.text_files import parse_toml, read_text
 
 _HERE = Path(__file__).resolve().parents[1]
-_MOST_ARENAS = 8  # in one image
 _HEADER = """\
 # A plan of liex_lab: all settings of a run. Copy this file, edit the copy, and use it with:
 #     liex run RECORDING --plan my-plan.toml
@@ -97,18 +96,16 @@ class Plan(SettingsTable):
 
     @model_validator(mode="after")
     def _apart(self) -> Plan:
-        if self.arenas is None:
-            return self
-        if self.arena.region is not None:
+        if self.arenas is not None and self.arena.region is not None:
             raise ValueError(
                 "arena.region is for one arena and [[arenas]] for several; leave one of them out"
             )
-        if self.arenas == "auto":
-            return self
-        if not 1 <= len(self.arenas) <= _MOST_ARENAS:
-            raise ValueError(f"[[arenas]] lists 1 to {_MOST_ARENAS} arenas, got {len(self.arenas)}")
-        if twice := first_twice(one.name for one in self.arenas):
-            raise ValueError(f"two [[arenas]] are called {twice}; give each a name of its own")
+        if isinstance(self.arenas, list):
+            n = len(self.arenas)
+            if not 1 <= n <= 8:
+                raise ValueError(f"[[arenas]] lists 1 to 8 arenas, got {n}")
+            if twice := first_twice(one.name for one in self.arenas):
+                raise ValueError(f"two [[arenas]] are called {twice}; give each a name of its own")
         return self
 
     def __repr__(self) -> str:

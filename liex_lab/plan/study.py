@@ -130,32 +130,42 @@ class StudyTable(SettingsTable):
     @model_validator(mode="after")
     def _agree(self) -> StudyTable:
         ids = [animal.id for animal in self.animals]
-        if twice := first_twice(ids):
-            raise ValueError(f"the animal {twice} is listed twice; keep one")
         arenas = [arena.name for arena in self.arenas]
-        if first_twice(arenas):
-            raise ValueError("two [[arenas]] have the same name; give each its own")
-        for one in self.sessions:
-            if one.animal not in ids:
-                raise ValueError(
-                    f"the session {one.session} is of {one.animal}, an animal that is not in "
-                    "[[animals]]"
-                )
-            if one.arena and one.arena not in arenas:
-                raise ValueError(
-                    f"the session {one.session} of {one.animal} is in the arena {one.arena}, which "
-                    "is not in [[arenas]]"
-                )
         recorded = Counter((one.arena, one.recording) for one in self.sessions if one.arena)
-        for (arena, recording), n in recorded.items():
-            if n > 1:
-                raise ValueError(
-                    f"two sessions are of the arena {arena} in {recording}; an arena holds one "
-                    "animal"
+        twice = first_twice(ids)
+        named = first_twice(f"{one.animal} has two sessions {one.session}" for one in self.sessions)
+        wrong = [
+            (twice, f"the animal {twice} is listed twice; keep one"),
+            (first_twice(arenas), "two [[arenas]] have the same name; give each its own"),
+            *(
+                (
+                    one.animal not in ids,
+                    f"the session {one.session} is of {one.animal}, an animal that is not in "
+                    "[[animals]]",
                 )
-        named = [f"{one.animal} has two sessions {one.session}" for one in self.sessions]
-        if twice := first_twice(named):
-            raise ValueError(f"the animal {twice}; give each its own name")
+                for one in self.sessions
+            ),
+            *(
+                (
+                    one.arena and one.arena not in arenas,
+                    f"the session {one.session} of {one.animal} is in the arena {one.arena}, which "
+                    "is not in [[arenas]]",
+                )
+                for one in self.sessions
+            ),
+            *(
+                (
+                    n > 1,
+                    f"two sessions are of the arena {arena} in {recording}; an arena holds one "
+                    "animal",
+                )
+                for (arena, recording), n in recorded.items()
+            ),
+            (named, f"the animal {named}; give each its own name"),
+        ]
+        for is_wrong, sentence in wrong:
+            if is_wrong:
+                raise ValueError(sentence)
         return self
 
 

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
 
 _PATIENCE_S = 4.0
-_AGAIN_S = 0.05
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 _SAID = {"SIGINT": "interrupted (Ctrl-C)", "SIGTERM": "ended (SIGTERM)", "SIGHUP": "ended (SIGHUP)"}
 
 
@@ -84,14 +82,14 @@ def ending() -> Iterator[None]:
         if not isinstance(what.exc_value, Ended):
             return usual(what)
         unheard.set()
-        later = threading.Timer(_AGAIN_S, _send, [what.exc_value.signal])
+        later = threading.Timer(0.05, _send, [what.exc_value.signal])
         later.daemon = True
         later.start()
         return None
 
     before = {}
     sys.unraisablehook = again
-    for name in _NAMES:
+    for name in _SAID:
         number = getattr(signal, name, None)
         if number is None or threading.current_thread() is not threading.main_thread():
             continue
@@ -157,26 +155,9 @@ def end_with_parent() -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def end_children(but: set[int]) -> None:
-    """Terminate the processes of this process's pools.
-
-    Args:
-        but: ids of processes to keep.
-    """
-    for child in multiprocessing.active_children():
-        if child.pid not in but:
-            child.terminate()
-
-
 # Worker pool of processes of this machine, for the shards of one recording.
 
 
-# cores per process, which uses more than one and a half
-_CORES = 2
-# maximum number of processes, each of about 400 MB
-_MOST = 4
-# frames; a process takes two seconds to start
-_WORTH_SHARING = 6000
 Work = TypeVar("Work")
 Done = TypeVar("Done")
 
@@ -238,7 +219,9 @@ class Processes:
                 ) from None
             except BaseException as error:
                 if not isinstance(error, Exception):  # end at once, as a shard takes minutes
-                    end_children(but=others)
+                    for child in multiprocessing.active_children():
+                        if child.pid not in others:
+                            child.terminate()
                 raise
             finally:
                 pool.shutdown(cancel_futures=True)
@@ -253,8 +236,9 @@ def processes_for(workers: int) -> Processes | None:
     """
     if workers:
         return Processes(workers) if workers > 1 else None
-    n = min(n_cores() // _CORES, _MOST)
-    return Processes(n, fewest=_WORTH_SHARING) if n > 1 else None
+    # a process uses more than one and a half cores and about 400 MB, and takes two seconds to start
+    n = min(n_cores() // 2, 4)
+    return Processes(n, fewest=6000) if n > 1 else None
 
 
 def n_cores() -> int:

@@ -40,7 +40,7 @@ def read(content: bytes, name: str) -> None:
         words_of(read_any_labels(path), np.arange(10) / 30.0, "o")
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(data=st.data(), packed=st.booleans())
 def test_any_value_anywhere_in_a_boris_project(data: st.DataObject, packed: bool) -> None:
     project: dict[str, Any] = copy.deepcopy(PROJECT)
@@ -49,13 +49,13 @@ def test_any_value_anywhere_in_a_boris_project(data: st.DataObject, packed: bool
     check(lambda: read(gzip.compress(text, 1) if packed else text, "a.boris"))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(document=ANYTHING)
 def test_any_json_instead_of_a_boris_project(document: Any) -> None:
     check(lambda: read(json.dumps({"observations": document}).encode(), "a.boris"))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     head=st.lists(st.sampled_from([*_OURS, *_BORIS]), min_size=1, max_size=8),
     rows=st.lists(st.lists(_CELLS, max_size=8), max_size=5),
@@ -70,7 +70,7 @@ def test_any_table_of_labels(
     check(lambda: read(text.encode("utf-8", "surrogatepass"), "a.tsv" if tabs else "a.csv"))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     content=st.binary(max_size=60),
     name=st.sampled_from(["a.boris", "a.csv", "a.tsv", "a.parquet", "a.boris.gz"]),

@@ -48,19 +48,19 @@ def check(read: Any) -> None:
         assert "\n" not in str(error), str(error)  # noqa: PT017
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(table=st.dictionaries(_WORDS | st.text(max_size=6), _TABLES, max_size=5))
 def test_whatever_a_plan_says_it_is_read_or_refused_in_one_sentence(table: dict[str, Any]) -> None:
     check(lambda: Plan.from_table(table))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(text=st.text(max_size=60))
 def test_whatever_a_plans_text_is_it_is_read_or_refused_in_one_sentence(text: str) -> None:
     check(lambda: Plan.from_toml(text))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     key=_WORDS | st.text(max_size=10),
     section=_WORDS | st.text(max_size=10),

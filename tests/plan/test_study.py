@@ -170,7 +170,7 @@ def inside(path: Path, folder: Path) -> bool:
     return Path(*path.resolve().parts[: len(folder.resolve().parts)]) == folder.resolve()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(table=st.dictionaries(_WORDS, _TABLES, max_size=5))
 def test_whatever_a_study_file_says_it_is_read_or_refused_in_one_sentence(
     table: dict[str, Any],

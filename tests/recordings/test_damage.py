@@ -19,7 +19,7 @@ from tests.recordings.every_format import FORMATS, Format
 from tests.recordings.writers import depth_frames
 
 STORED = depth_frames(6)
-FEW = 25  # damaged variants of a format outside the nightly run
+FEW = 10  # damaged variants of a format outside the nightly run
 SECONDS = 5  # far more than any takes; a hang otherwise
 
 

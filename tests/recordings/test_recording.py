@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-import liex_lab
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
 from liex_lab.recordings.frame import depth_mm
@@ -45,18 +44,6 @@ def in_memory(
 
     times = np.array(even_times(n) if times_ns is None else times_ns)
     return Recording(name="memory", format="synthetic", camera=SMALL, times_ns=times, read=read)
-
-
-def test_a_recording_reads_only_what_is_asked_for() -> None:
-    reads: list[int] = []
-    recording = in_memory(100, reads=reads)
-    assert recording.duration_s > 0
-    assert recording.gaps == []
-    assert recording[10:90].rate_hz > 0
-    assert reads == []
-    chunks = recording.chunks(8)
-    assert [frame.index for frame in next(chunks)] == list(range(8))
-    assert reads == list(range(8))
 
 
 def test_chunks_hold_every_frame_once() -> None:
@@ -348,10 +335,6 @@ def test_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "TMPDIR" in refusal(archive)
 
 
-def test_the_package_hands_out_the_same_door() -> None:
-    assert liex_lab.open_recording is open_recording
-
-
 def test_a_format_brings_only_its_own_libraries(tmp_path: Path) -> None:
     folder = write_moseq_folder(tmp_path / "s", depth_frames(1, 512, 424))
     code = (
@@ -362,11 +345,3 @@ def test_a_format_brings_only_its_own_libraries(tmp_path: Path) -> None:
     )
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.strip() == "set()"
-
-
-def test_the_camera_of_a_recording_is_for_its_pictures(tmp_path: Path) -> None:
-    with open_recording(write_png_folder(tmp_path / "r", FOUR_FRAMES)) as recording:
-        assert (recording.camera.width, recording.camera.height) == recording.frame(0).depth.shape[
-            ::-1
-        ]
-        assert recording.camera.fx == SMALL.fx

@@ -20,9 +20,7 @@ from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.timestamp_files import UNITS, name_times, read_stamps
 from liex_lab.recordings.timestamps import (
     FAULTS,
-    Gap,
     clock_doubts,
-    find_faults,
     find_gaps,
     frame_counts,
     from_rate,
@@ -72,13 +70,6 @@ def test_no_other_choice_moves_fewer_stamps(times: list[int]) -> None:
     )
 
 
-def test_one_wild_stamp_does_not_drag_its_neighbours_along() -> None:
-    found = make_monotone(np.array([0, 33, 10**12, 100, 133]))
-    np.testing.assert_array_equal(found.times_ns, [0, 33, 66, 100, 133])
-    assert "1 of 5" in str(found.problem)
-    assert find_faults(found.times_ns, 33, found.faults) == [Gap(2, 3, 66, 100, 0, "clock_jumped")]
-
-
 def test_stamps_that_are_moved_are_spread_evenly_between_those_that_stay() -> None:
     np.testing.assert_array_equal(
         make_monotone(np.array([0, 33, 33, 99, 132])).times_ns, [0, 33, 66, 99, 132]
@@ -95,17 +86,6 @@ def test_stamps_that_are_moved_are_spread_evenly_between_those_that_stay() -> No
     np.testing.assert_array_equal(
         make_monotone(np.array([900, 901, 60, 90, 120])).times_ns, [0, 30, 60, 90, 120]
     )
-
-
-def faults_of(times: list[int]) -> list[str]:
-    return [FAULTS[fault] for fault in make_monotone(np.array(times, np.int64)).faults]
-
-
-def test_each_stamp_that_is_moved_is_told_with_its_reason() -> None:
-    assert faults_of([0, 33, 66, 99]) == ["", "", "", ""]
-    assert sorted(faults_of([0, 33, 33, 66])) == ["", "", "", "stamp_repeated"]
-    assert faults_of([0, 66, 33, 99]).count("stamp_out_of_order") == 1
-    assert faults_of([0, 33, 10**12, 99])[2] == "clock_jumped"
 
 
 @pytest.mark.parametrize("back", [10**6, 10**9, 3600 * 10**9])
@@ -361,12 +341,6 @@ def test_a_csv_is_read_whatever_program_wrote_it(tmp_path: Path, content: str) -
     assert times_of(path, content) == [5, 7]
 
 
-def test_moseq_stamps_may_have_a_header_and_commas(tmp_path: Path) -> None:
-    path = tmp_path / "depth_ts.txt"
-    found = times_of(path, "time,other\n1.5, 0\n2.5, 0\n", usual_ns=10**6)
-    assert found == [1_500_000, 2_500_000]
-
-
 @pytest.mark.parametrize(
     ("content", "says"),
     [
@@ -450,18 +424,6 @@ def test_rounded_stamps_give_the_true_rate_and_every_gap(data: st.DataObject) ->
     ]
 
 
-@given(
-    st.sampled_from([33_333_333, 40_000_000, 16_666_667, 10_000_000, 20_000_000, 100_000_000]),
-    st.lists(st.integers(1, 9), min_size=3, max_size=60),
-)
-def test_the_step_of_exact_stamps_is_their_median_as_before(step: int, apart: list[int]) -> None:
-    times = np.append(0, np.cumsum(apart)) * step
-    if np.median(apart) == 1:
-        assert median_step(times) == step
-        missing = [gap.n_frames_missing for gap in find_gaps(times, step)]
-        assert missing == [one - 1 for one in apart if one > 1]
-
-
 def test_stamps_of_a_clock_that_cannot_be_told_keep_their_median_step() -> None:
     bursts = np.cumsum(np.tile([100_000, 100_000, 100_000, 133_033_333], 30))
     assert median_step(bursts) == 100_000, "which is doubted"
@@ -500,7 +462,7 @@ def written(ns: int, unit: str, digits: int | None) -> str:
     return f"{whole}.{fraction}" if fraction else whole
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     n=st.integers(12, 40),
     hz=st.sampled_from([12.5, 25.0, 29.97, 30.0, 60.0, 90.0, 200.0]),

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from liex_lab.runtime import kernel_cache
-from liex_lab.runtime.kernel_cache import VARIABLE, keep_kernels
+from liex_lab.runtime.kernel_cache import VARIABLE, ignore_outdated_kernels, keep_kernels
 from tests.conftest import REPOSITORY
 
 
@@ -73,6 +73,15 @@ def test_liex_starts_where_a_stated_place_cannot_be_written() -> None:
     assert "liex-kernels-" in ran.stdout
 
 
+def test_an_index_that_names_an_earlier_type_is_empty(monkeypatch: pytest.MonkeyPatch) -> None:
+    from numba.core.caching import IndexDataCacheFile
+
+    monkeypatch.setattr(IndexDataCacheFile, "_load_index", lambda self: self.renamed)
+    ignore_outdated_kernels()
+    assert IndexDataCacheFile._load_index(object()) == {}
+
+
+@pytest.mark.nightly
 def test_kernels_of_an_earlier_version_are_compiled_again(tmp_path: Path) -> None:
     """Their index names a record type that has another name now."""
     source = """

@@ -156,7 +156,8 @@ def test_a_chunk_that_memory_does_not_suffice_for_is_not_damaged(
     assert isinstance(caught.value, MemoryError)
 
 
-@pytest.mark.parametrize("limit", ["-n 24", pytest.param("-v 2000000", marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("limit", ["-n 24", "-v 2000000"])
 def test_a_run_within_a_narrow_limit_ends_in_a_sentence(limit: str, tmp_path: Path) -> None:
     command = f'ulimit {limit} && "{sys.executable}" -m liex_lab run "{SAMPLE}" --out "{tmp_path}"'
     done = subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)

@@ -109,7 +109,7 @@ def test_what_is_under_way_is_put_down_and_said(number: int, code: int) -> None:
     assert seconds < 5.0 + SLACK_S
 
 
-@pytest.mark.parametrize("work", [STUCK, DEAF])
+@pytest.mark.parametrize("work", [STUCK, pytest.param(DEAF, marks=pytest.mark.nightly)])
 def test_what_does_not_end_is_ended(work: str) -> None:
     returned, _, err, seconds = ended(work, signal.SIGTERM)
     assert returned == 143

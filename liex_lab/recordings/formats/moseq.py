@@ -55,9 +55,8 @@ if TYPE_CHECKING:
     from liex_lab.recordings.formats.video import DepthVideo
 
 
-_PIECE = (
-    1 << 17
-)  # bytes read or unpacked at once: an empty image is a thousand times its packed size
+_PACKED = 1 << 18  # packed bytes read at once
+_PIECE = 1 << 17  # unpacked bytes: an empty image is a thousand times its packed size
 _GZIP_MAGIC = b"\x1f\x8b"
 
 
@@ -149,13 +148,13 @@ class _ArchiveBytes:
         """The archive unpacked by ISA-L, or by zlib up to the last good byte."""
         library: Any = isal_zlib if fast else zlib
         inflate = library.decompressobj(31)
-        while packed := self._file.read(_PIECE):
+        while packed := self._file.read(_PACKED):
             while packed:
                 if inflate.eof:
                     # a gzip file may have several members; anything else after it is
                     # padding
                     if len(packed) < len(_GZIP_MAGIC):
-                        packed += self._file.read(_PIECE)
+                        packed += self._file.read(_PACKED)
                     if not packed.startswith(_GZIP_MAGIC):
                         return
                     inflate = library.decompressobj(31)
@@ -365,14 +364,16 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         raise RecordingError(
             f"{METADATA} of the session is not JSON ({error}); correct or remove it"
         ) from None
-    named = {
-        "subject_id": document.get("SubjectName"),
-        "session_name": document.get("SessionName"),
-    }
-    facts = {key: str(said).strip() for key, said in named.items() if type(said) in (str, int)}
     stated = document.get("StartTime")
-    facts |= {"session_start_time": start_of_day(stated) or ""}
-    facts = {key: said for key, said in facts.items() if said}
+    facts = {
+        key: str(value).strip()
+        for key, value in {
+            "subject_id": document.get("SubjectName"),
+            "session_name": document.get("SessionName"),
+            "session_start_time": start_of_day(stated),
+        }.items()
+        if type(value) in (str, int) and str(value).strip()
+    }
     problems = []
     if stated is not None and "session_start_time" not in facts:
         problems.append(
@@ -388,19 +389,16 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
             f"{METADATA} states DepthResolution = {size!r}; it is [width, height] in pixels"
         )
     dtype = ">u2" if document.get("IsLittleEndian", True) is False else "<u2"
-    return Metadata(size and tuple(size), dtype, *_stated_camera(document), facts, problems)
-
-
-def _stated_camera(document: dict[str, Any]) -> tuple[str | None, str]:
-    """Kind and stated name of the camera: programs for MoSeq have no common key for it."""
+    # programs for MoSeq have no common key for the camera
     entries = {
         key.lower().replace("_", "").replace(" ", ""): value for key, value in document.items()
     }
-    stated = (entries[key].strip() for key in _CAMERA_KEYS if isinstance(entries.get(key), str))
-    name = next(filter(None, stated), "")
+    named = (entries[key].strip() for key in _CAMERA_KEYS if isinstance(entries.get(key), str))
+    name = next(filter(None, named), "")
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
     known = (camera for word, camera in _CAMERA_WORDS.items() if word in plain)
-    return next(known, OTHER if name else None), name
+    kind = next(known, OTHER if name else None)
+    return Metadata(size and tuple(size), dtype, kind, name, facts, problems)
 
 
 def read_session_stamps(

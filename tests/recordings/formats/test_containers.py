@@ -53,7 +53,11 @@ WRITERS: dict[str, Writer] = {
 }
 
 
-@pytest.fixture(params=WRITERS)
+# what is calibrated and where is decided after the containers are read
+_OTHERS = [pytest.param(name, marks=pytest.mark.nightly) for name in ("bag", "db3")]
+
+
+@pytest.fixture(params=["mcap", *_OTHERS])
 def write(request: pytest.FixtureRequest, tmp_path: Path) -> Writer:
     def written(**how: Any) -> Path:
         return WRITERS[request.param](tmp_path, **{"camera": QVGA, **how})

@@ -1,6 +1,5 @@
 """Folders of PNG and TIFF images."""
 
-import json
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -45,17 +44,6 @@ def test_pictures_are_in_the_order_a_person_would_count_them(tmp_path: Path) -> 
         for frame in recording:
             np.testing.assert_array_equal(frame.depth, STORED[frame.index])
         assert recording.problems == []
-
-
-def test_stamps_are_exact_in_nanoseconds_and_in_seconds(tmp_path: Path) -> None:
-    times = even_times(12)
-    folder = write_png_folder(tmp_path / "r", STORED, times_ns=times)
-    with open_recording(folder) as recording:
-        assert recording.times_ns.tolist() == times
-        assert recording.metadata["session_start_time"].startswith("2025-10-09T08:53:20")
-    write_times(folder, times, seconds=True)
-    with open_recording(folder) as recording:
-        assert recording.times_ns.tolist() == times
 
 
 def test_units_and_unread_values_are_as_stated(tmp_path: Path) -> None:
@@ -351,17 +339,6 @@ def test_a_cut_tiff_among_whole_ones_is_wholly_unread(tmp_path: Path) -> None:
         for frame in recording:
             expected = np.zeros_like(STORED[0]) if frame.index in (3, 5) else STORED[frame.index]
             np.testing.assert_array_equal(frame.depth, expected)
-
-
-def test_a_camera_toml_written_from_a_camera_reads_back(tmp_path: Path) -> None:
-    folder = write_png_folder(tmp_path / "r", STORED[:2])
-    lines = [
-        f"{key} = {json.dumps(value)}" for key, value in SMALL.to_dict().items() if key != "source"
-    ]
-    (folder / "camera.toml").write_text("\n".join(["[camera]", *lines]))
-    with open_recording(folder) as recording:
-        assert recording.camera.to_dict() | {"source": "stated"} == SMALL.to_dict()
-        assert recording.problems == []
 
 
 # Images of the rarer kinds: PGM in both byte orders, PCLZF, and the encodings of depth that data

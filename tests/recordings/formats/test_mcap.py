@@ -24,15 +24,12 @@ from foxglove.messages import (
     Timestamp,
     Vector3,
 )
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
-from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from liex_lab.errors import RecordingError
-from liex_lab.optics.camera import Distortion
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.formats.messages.mcap import McapFile
 from liex_lab.recordings.formats.messages.rosbag import BagFile
@@ -59,16 +56,6 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "r.mcap"
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "mono16", "png"])
-def test_sixteen_bits_are_millimetres(path: Path, encoding: str) -> None:
-    with open_recording(write_mcap(path, STORED, encoding=encoding)) as recording:
-        for frame in recording:
-            np.testing.assert_array_equal(frame.depth, STORED[frame.index])
-        assert recording.problems == []
-        assert recording.camera.source == "CameraCalibration on /camera/calibration"
-        assert (recording.camera.fx, recording.camera.cy) == (SMALL.fx, SMALL.cy)
-
-
 def test_floats_are_metres_and_nan_is_unread(path: Path) -> None:
     stored = STORED.astype(np.float32) / 1000
     stored[:, 0, :3] = [np.nan, np.inf, -1.0]
@@ -78,43 +65,6 @@ def test_floats_are_metres_and_nan_is_unread(path: Path) -> None:
     np.testing.assert_allclose(depth[1:], STORED[5, 1:], atol=1e-4)
 
 
-@pytest.mark.parametrize("compression", [MCAPCompression.Zstd, MCAPCompression.Lz4, None])
-@pytest.mark.parametrize("use_chunks", [True, False])
-def test_every_packing_reads_alike(
-    path: Path, compression: MCAPCompression | None, use_chunks: bool
-) -> None:
-    write_mcap(path, STORED, compression=compression, use_chunks=use_chunks, padding=6)
-    with open_recording(path, strict=True) as recording:
-        for index in (19, 3, 4, 0):
-            np.testing.assert_array_equal(recording.frame(index).depth, STORED[index])
-
-
-def test_it_agrees_with_the_reader_of_mcap_itself(path: Path) -> None:
-    write_mcap(path, STORED, log_delay_ns=5_000_000)
-    with path.open("rb") as file, open_recording(path) as recording:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        decoded = [
-            message.decoded_message
-            for message in reader.iter_decoded_messages(topics=["/camera/depth"])
-        ]
-        assert len(decoded) == len(recording)
-        for frame, message in zip(recording, decoded, strict=True):
-            assert frame.time_ns == message.timestamp.ToNanoseconds()
-            np.testing.assert_array_equal(frame.depth.ravel(), np.frombuffer(message.data, "<u2"))
-
-
-def test_the_sensors_stamp_comes_before_the_time_of_logging(path: Path) -> None:
-    times = even_times(20)
-    with open_recording(write_mcap(path, STORED, log_delay_ns=7_000_000)) as recording:
-        assert recording.times_ns.tolist() == times
-        assert recording.metadata["session_start_time"].startswith("2025-10-09T08:53:20")
-    with open_recording(
-        write_mcap(path, STORED, stamped=False, log_delay_ns=7_000_000)
-    ) as recording:
-        assert recording.times_ns.tolist() == [t + 7_000_000 for t in times]
-        assert any("no stamp" in problem for problem in recording.problems)
-
-
 def test_a_sensor_clock_may_begin_at_zero(path: Path) -> None:
     times = even_times(20, start_ns=0)
     with open_recording(
@@ -122,32 +72,6 @@ def test_a_sensor_clock_may_begin_at_zero(path: Path) -> None:
     ) as recording:
         assert recording.times_ns.tolist() == times
         assert recording.metadata == {}
-
-
-def test_several_depth_topics_are_named_and_one_is_chosen(path: Path) -> None:
-    write_mcap(path, STORED, topics=("/left/depth", "/right/depth"))
-    sentence = refusal(path)
-    assert "/left/depth, /right/depth" in sentence
-    with open_recording(path, topic="/right/depth") as recording:
-        assert len(recording) == 20
-        assert recording.camera.source == "CameraCalibration on /right/calibration"
-    assert "/left/depth, /right/depth" in refusal(path, topic="/depth")
-
-
-def test_a_camera_may_be_stated_where_the_file_has_none(path: Path) -> None:
-    write_mcap(path, STORED, camera=None)
-    assert "camera.toml" in refusal(path)
-    with open_recording(path, camera=SMALL) as recording:
-        assert recording.camera == SMALL
-    write_camera(path.parent)
-    with open_recording(path) as recording:
-        assert recording.camera.source == "camera.toml"
-
-
-def test_distortion_belongs_to_the_camera(path: Path) -> None:
-    with open_recording(write_mcap(path, STORED, distortion=[0.1, 0, 0, 0, 0])) as recording:
-        assert recording.camera.distortion == Distortion.of("plumb_bob", [0.1])
-        assert recording.problems == []
 
 
 def test_a_picture_of_another_size_is_wholly_unread_and_told(path: Path) -> None:
@@ -299,15 +223,15 @@ def test_a_file_says_by_its_index_what_it_says_when_it_is_walked(path: Path, kin
         assert facts(indexed) == facts(walked)
 
 
-@pytest.mark.parametrize("share", np.linspace(0.05, 0.99, 8).round(3).tolist())
-@pytest.mark.parametrize("kind", ["zstd", "none", "ros 2"])
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.99])
+@pytest.mark.parametrize("kind", ["zstd", "ros 2"])
 def test_a_cut_file_is_refused_at_once(path: Path, kind: str, share: float) -> None:
     KINDS[kind](path)
     cut(path, share)
     assert "cut" in refusal(path, strict=True)
 
 
-@pytest.mark.parametrize("kind", ["zstd", "lz4", "none", "ros 2"])
+@pytest.mark.parametrize("kind", ["zstd", "none"])
 def test_no_damage_anywhere_is_taken_for_depth(path: Path, kind: str) -> None:
     KINDS[kind](path)
     whole = path.read_bytes()
@@ -315,7 +239,7 @@ def test_no_damage_anywhere_is_taken_for_depth(path: Path, kind: str) -> None:
         stored = {(frame.time_ns, frame.depth.tobytes()) for frame in recording}
     rng = np.random.default_rng(5)
     told = []
-    for at in np.linspace(10, len(whole) - 10, 60).astype(int):
+    for at in np.linspace(10, len(whole) - 10, 24).astype(int):
         content = bytearray(whole)
         content[at : at + 8] = rng.integers(0, 256, 8).astype(np.uint8).tobytes()
         path.write_bytes(content)
@@ -326,7 +250,7 @@ def test_no_damage_anywhere_is_taken_for_depth(path: Path, kind: str) -> None:
                 assert len(seen) == len(stored)
         except RecordingError as error:
             told.append(str(error))
-    assert len(told) > 30
+    assert len(told) > 12
     assert not any("\n" in sentence for sentence in told)
 
 
@@ -440,31 +364,20 @@ CALIBRATION = {
 }
 
 
-def test_raw_pictures_in_json(tmp_path: Path) -> None:
-    shape = {"width": 64, "height": 48, "step": 128, "encoding": "16UC1"}
-    messages = [
-        json_message(k, frame.tobytes(), **shape) for k, frame in enumerate(FOXGLOVE_STORED)
-    ]
-    with open_recording(
-        write_json(tmp_path / "r.mcap", "foxglove.RawImage", messages, CALIBRATION)
-    ) as recording:
-        assert recording.times_ns.tolist() == even_times(len(FOXGLOVE_STORED))
-        assert (recording.camera.fx, recording.problems, recording.truncated) == (
-            SMALL.fx,
-            [],
-            False,
-        )
-        np.testing.assert_array_equal([frame.depth for frame in recording], FOXGLOVE_STORED)
-
-
-def test_packed_pictures_in_json(tmp_path: Path) -> None:
+@pytest.mark.parametrize("packed", [False, True])
+def test_images_in_json(tmp_path: Path, packed: bool) -> None:
     messages = [
         json_message(k, cv2.imencode(".png", frame)[1].tobytes(), format="png")
+        if packed
+        else json_message(k, frame.tobytes(), width=64, height=48, step=128, encoding="16UC1")
         for k, frame in enumerate(FOXGLOVE_STORED)
     ]
-    with open_recording(
-        write_json(tmp_path / "r.mcap", "foxglove.CompressedImage", messages, CALIBRATION)
-    ) as recording:
+    schema = f"foxglove.{'Compressed' if packed else 'Raw'}Image"
+    path = write_json(tmp_path / "r.mcap", schema, messages, CALIBRATION)
+    with open_recording(path) as recording:
+        assert recording.times_ns.tolist() == even_times(len(FOXGLOVE_STORED))
+        told = (recording.camera.fx, recording.problems, recording.truncated)
+        assert told == (SMALL.fx, [], False)
         np.testing.assert_array_equal([frame.depth for frame in recording], FOXGLOVE_STORED)
 
 
@@ -548,7 +461,7 @@ def test_a_cloud_may_lie_in_a_frame_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("compression", [MCAPCompression.Zstd, MCAPCompression.Lz4, None])
-@pytest.mark.parametrize("share", np.linspace(0.2, 0.99, 9).round(3).tolist())
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.99])
 def test_a_cut_chunk_gives_what_it_still_holds(
     tmp_path: Path, share: float, compression: MCAPCompression | None
 ) -> None:
@@ -575,7 +488,7 @@ def test_zeros_at_the_end_are_no_records(tmp_path: Path) -> None:
     """A file system that fills up with zeros; nine bytes at a time would take for ever."""
     path = write_mcap(tmp_path / "r.mcap", FOXGLOVE_STORED)
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * 0.7)] + bytes(50_000_000))
+    path.write_bytes(content[: int(len(content) * 0.7)] + bytes(5_000_000))
     with open_recording(path) as recording:
         assert recording.truncated
         assert len(recording) >= 4

@@ -13,7 +13,6 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from tests.recordings.asking import refusal
 from tests.recordings.writers import (
-    SMALL,
     cut,
     depth_frames,
     write_archive,
@@ -55,16 +54,11 @@ def test_a_kinect_session_needs_no_camera_file_but_says_so(tmp_path: Path) -> No
             np.testing.assert_array_equal(frame.depth, KINECT[frame.index])
 
 
-def test_the_depth_file_alone_opens_its_session(folder: Path) -> None:
-    with open_recording(folder / "depth.dat") as recording:
-        assert (len(recording), recording.name) == (20, "session_1")
-
-
-def test_metadata_is_often_missing(tmp_path: Path) -> None:
+def test_metadata_is_often_missing_and_the_depth_file_opens_its_session(tmp_path: Path) -> None:
     path = write_moseq_folder(tmp_path / "s", KINECT)
     (path / "metadata.json").unlink()
-    with open_recording(path) as recording:
-        assert (len(recording), recording.width, recording.metadata) == (3, 512, {})
+    with open_recording(path / "depth.dat") as recording:
+        assert (recording.name, len(recording), recording.metadata) == ("s", 3, {})
 
 
 def test_another_size_than_the_kinects_is_found_out(tmp_path: Path) -> None:
@@ -149,11 +143,6 @@ def test_a_start_without_a_zone_is_left_out_and_told(folder: Path) -> None:
         assert any("StartTime" in problem for problem in recording.problems)
 
 
-def test_wrong_stamps_are_told_in_a_sentence(folder: Path) -> None:
-    (folder / "depth_ts.txt").write_text("1 0\n2 0\noops 0\n")
-    assert "'oops' on line 3" in refusal(folder)
-
-
 def test_an_archive_is_unpacked_once_and_cleared_away(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -216,7 +205,7 @@ def test_names_cannot_lead_out_of_the_cache(folder: Path, tmp_path: Path) -> Non
     assert not (tmp_path.parent / "depth.dat").exists()
 
 
-@pytest.mark.parametrize("share", [0.15, 0.31, 0.5, 0.77, 0.9, 0.985])
+@pytest.mark.parametrize("share", [0.15, 0.5, 0.985])
 @pytest.mark.parametrize("order", [STAMPED_FIRST, DEPTH_FIRST])
 def test_a_cut_archive_gives_every_whole_frame(
     folder: Path, tmp_path: Path, share: float, order: tuple[str, ...]
@@ -237,7 +226,7 @@ def test_a_cut_archive_gives_every_whole_frame(
     assert f"{n} whole frame" in refusal(archive, strict=True)
 
 
-@pytest.mark.parametrize("packed", [1, 7, 1000, 1 << 16])
+@pytest.mark.parametrize("packed", [1, 1000])
 def test_an_archive_may_be_several_gzips_one_after_the_other(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packed: int
 ) -> None:
@@ -272,17 +261,6 @@ def _slow_gunzip(archive: Path) -> bytes:
         except EOFError:
             pass
     return bytes(out)
-
-
-def test_a_cut_kinect_archive_loses_its_stamps_but_not_its_frames(tmp_path: Path) -> None:
-    frames = depth_frames(4, 512, 424)
-    archive = write_archive(write_moseq_folder(tmp_path / "s", frames), tmp_path / "s.tar.gz")
-    cut(archive, 0.7)
-    with open_recording(archive) as recording:
-        assert (len(recording), recording.truncated) == (2, True)
-        assert recording.rate_hz == pytest.approx(30)
-        assert any("no time stamps" in problem for problem in recording.problems)
-        np.testing.assert_array_equal(recording.frame(1).depth, frames[1])
 
 
 def test_an_archive_that_is_cut_among_its_stamps_keeps_every_frame(
@@ -331,10 +309,3 @@ def test_two_sessions_in_one_archive_are_not_mixed(folder: Path, tmp_path: Path)
         tar.add(folder, arcname="a")
         tar.add(folder, arcname="b")
     assert "more than one" in refusal(path)
-
-
-def test_a_stated_camera_comes_before_every_file(folder: Path) -> None:
-    camera = Camera(99.0, 99.0, 31.5, 23.5, 64, 48, source="plan")
-    with open_recording(folder, camera=camera) as recording:
-        assert recording.camera == camera
-    assert SMALL.fx != camera.fx

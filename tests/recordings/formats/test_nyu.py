@@ -165,13 +165,6 @@ def labels(n: int) -> np.ndarray:
     return np.concatenate([LABEL_CAMERA.project(points), points[..., 2:]], axis=-1)
 
 
-def test_every_point_is_a_mean_of_joints() -> None:
-    weights = points_of_joints(HAND)
-    assert weights.shape == (14, 23)
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
-    assert (weights >= 0).all()
-
-
 def test_hands_are_found_from_their_fourteen_points() -> None:
     points = uvd_to_mm(labels(20))
     assert fit_hands(HAND, points).residual_mm.mean() < 0.5
@@ -180,8 +173,8 @@ def test_hands_are_found_from_their_fourteen_points() -> None:
 def test_our_skeleton_fits_both_people_of_the_test_set(reference_data: Path) -> None:
     truth = NyuReference.load(reference_data / "hand_nyu").truth
     for rows, size in (
-        (slice(0, N_FIRST_PERSON, 60), 1.09),
-        (slice(N_FIRST_PERSON, None, 150), 0.91),
+        (slice(0, N_FIRST_PERSON, 240), 1.09),
+        (slice(N_FIRST_PERSON, None, 600), 0.91),
     ):
         fit = fit_hands(HAND, truth[rows])
         assert fit.residual_mm.mean() < 3.0  # the labels' own scatter is about that

@@ -246,12 +246,9 @@ def test_a_day_in_the_file_is_the_day_of_the_recording(tmp_path: Path) -> None:
         assert recording.metadata == {"session_start_time": "2020-01-06T10:40:00.123456+00:00"}
 
 
-@pytest.mark.parametrize("video", ["depth.avi", "depth.mkv"])
-def test_a_video_may_lie_in_an_archive(tmp_path: Path, video: str) -> None:
-    archive = write_archive(
-        write_video_session(tmp_path / "s", STORED, video), tmp_path / "s.tar.gz"
-    )
-    with open_recording(archive, strict=True) as recording:
+def test_a_video_may_lie_in_an_archive(tmp_path: Path) -> None:
+    session = write_video_session(tmp_path / "s", STORED, "depth.mkv")
+    with open_recording(write_archive(session, tmp_path / "s.tar.gz"), strict=True) as recording:
         np.testing.assert_array_equal(recording.frame(17).depth, STORED[17])
 
 

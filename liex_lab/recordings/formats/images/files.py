@@ -19,6 +19,7 @@ import xml.etree.ElementTree as ET  # nosec B405: see B314 below
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -554,7 +555,14 @@ class TiffStack(Stack):
                 return None
             return np.asarray(self._open.asarray(key=page.page))
         except Exception:  # damage in compressed data raises almost any exception
-            return _decode_with_opencv(page)
+            import cv2  # decodes LZW and other codecs that tifffile lacks
+
+            images: Any = ()
+            with suppress(cv2.error):
+                _, images = cv2.imreadmulti(
+                    str(page.path), page.page, 1, flags=cv2.IMREAD_UNCHANGED
+                )
+            return np.asarray(images[0]) if images and images[0].ndim == 2 else None
 
     def _unpacks_to_itself(self, page: Any) -> bool:
         """Whether no packed piece is larger than the image after unpacking.
@@ -596,17 +604,6 @@ def _fits(packed: bytes, compression: int, most: int) -> bool:
         return False
     except zlib.error:
         return True  # the decoder reports damage
-
-
-def _decode_with_opencv(page: _Page) -> Stored | None:
-    """Decode LZW and other codecs that tifffile lacks; None if OpenCV fails as well."""
-    import cv2
-
-    try:
-        found, images = cv2.imreadmulti(str(page.path), page.page, 1, flags=cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
-    return np.asarray(images[0]) if found and images and images[0].ndim == 2 else None
 
 
 def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:

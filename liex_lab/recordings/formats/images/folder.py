@@ -137,8 +137,14 @@ def open_images(
         else (next(kind for kind, ends in KINDS.items() if path.suffix.lower() in ends), [path])
     )
     refuse_infrared(path, f"{path.name if path.is_dir() else ''}/{files[0].stem}")
-    if kind == "PCLZF":
-        camera_toml = _with_xml(camera_toml, files[0])
+    if kind == "PCLZF" and not camera_toml.intrinsics and (xml := read_pclzf_camera(files[0])):
+        unit_mm = xml.pop("unit_mm")
+        camera_toml = replace(
+            camera_toml,
+            intrinsics=xml,
+            unit_mm=camera_toml.unit_mm if camera_toml.path.is_file() else unit_mm,
+            source="the XML files beside the images",
+        )
     stack = open_stack(kind, files, camera_toml, progress)
     return image_recording("images", path, files, camera_toml, stack, camera, fps)
 
@@ -257,20 +263,6 @@ def _times(
             "taken for frames that are missing"
         )
     return kept, from_rate(n if counts is None else counts, hz), False
-
-
-def _with_xml(camera_file: CameraFile, image: Path) -> CameraFile:
-    """The camera file completed by the intrinsics in PCL's XML file of an image."""
-    found = None if camera_file.intrinsics else read_pclzf_camera(image)
-    if found is None:
-        return camera_file
-    unit_mm = found.pop("unit_mm")
-    return replace(
-        camera_file,
-        intrinsics=found,
-        unit_mm=camera_file.unit_mm if camera_file.path.is_file() else unit_mm,
-        source="the XML files beside the images",
-    )
 
 
 def open_stack(kind: str, files: list[Path], camera_file: CameraFile, progress: Progress) -> Stack:

@@ -270,7 +270,21 @@ def open_raytrix(
     else:
         kind, files = list_pictures(folder, profile.pattern)
         stack = open_stack(kind, files, camera_toml, progress)
-        camera_toml = _with_lens(camera_toml, profile, stack, path)
+        # intrinsics from lens and sensor, unless a camera.toml states measured ones
+        if not camera_toml.intrinsics and profile.focal_mm and profile.pitch_mm:
+            f_px = profile.focal_mm / (profile.pitch_mm * profile.resolution_divisor)
+            centre = {"cx": (stack.width - 1) / 2.0, "cy": (stack.height - 1) / 2.0}
+            estimated = (
+                f"the focal length of {f_px:.1f} px follows from focal_mm and pitch_mm in "
+                f"{path.name}; a lens that is focused close up has a longer one, so measure a "
+                "ruler at a known distance and state fx and fy in camera.toml"
+            )
+            camera_toml = replace(
+                camera_toml,
+                intrinsics={"fx": f_px, "fy": f_px, **centre},
+                source=path.name,
+                problems=(*camera_toml.problems, estimated),
+            )
         decode = profile.decode
         with closing_on_error(stack):
             _check(stack, profile, path)
@@ -311,25 +325,6 @@ def no_profile_error(folder: Path) -> RecordingError:
         f"write a {PROFILE_FILE} "
         f'into it with a line such as profile = "raytrix-f32-negative-mm" (one of {listed}), and '
         "a camera.toml"
-    )
-
-
-def _with_lens(camera_toml: CameraFile, profile: Profile, stack: Stack, path: Path) -> CameraFile:
-    """Intrinsics from lens and sensor, unless a camera.toml states measured ones."""
-    if camera_toml.intrinsics or profile.focal_mm is None or profile.pitch_mm is None:
-        return camera_toml
-    f_px = profile.focal_mm / (profile.pitch_mm * profile.resolution_divisor)
-    centre = {"cx": (stack.width - 1) / 2.0, "cy": (stack.height - 1) / 2.0}
-    estimated = (
-        f"the focal length of {f_px:.1f} px follows from focal_mm and pitch_mm in {path.name}; a "
-        "lens that is focused close up has a longer one, so measure a ruler at a known distance "
-        "and state fx and fy in camera.toml"
-    )
-    return replace(
-        camera_toml,
-        intrinsics={"fx": f_px, "fy": f_px, **centre},
-        source=path.name,
-        problems=(*camera_toml.problems, estimated),
     )
 
 

@@ -42,6 +42,7 @@ from liex_lab.recordings.formats.messages.messages import (
     DamagedChunk,
     Envelope,
     IndexedMessages,
+    IsRelevant,
     MessageFile,
     MessagePlace,
     unpacked,
@@ -74,8 +75,6 @@ DAMAGE = (
     struct.error,
     EOFError,
 )
-
-IsRelevant = Callable[[Channel], bool]
 
 
 def open_mcap(

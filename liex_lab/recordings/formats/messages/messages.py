@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from bisect import bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
@@ -197,6 +197,9 @@ class Channel(NamedTuple):
     encoding: str
 
 
+IsRelevant = Callable[[Channel], bool]  # whether the messages of a channel are relevant
+
+
 class Envelope(NamedTuple):
     """A message from the walk.
 
@@ -287,9 +290,7 @@ class MessageFile(ABC):
         self._last_chunk: tuple[int, memoryview] = (-1, memoryview(b""))
 
     @abstractmethod
-    def walk(
-        self, wanted: Callable[[Channel], bool], progress: Progress
-    ) -> Iterator[Envelope | IndexedMessages]:
+    def walk(self, wanted: IsRelevant, progress: Progress) -> Iterator[Envelope | IndexedMessages]:
         """Every whole message of the wanted channels, in file order.
 
         Args:
@@ -393,8 +394,14 @@ def unpacked(packed: bytes, chunk: Chunk, first: int | None = None) -> bytes:
         DamagedChunk: it cannot be unpacked to its original bytes, or its compression is unknown.
     """
     size = chunk.size if first is None else first
-    with _codec_errors():
+    try:
         data = _inflate(packed, chunk.packing, size)
+    except DamagedChunk:
+        raise
+    except Exception as error:
+        if why_short(error):  # not a fault of the file
+            raise MemoryError(str(error)) from None
+        raise DamagedChunk(str(error)) from None
     if chunk.cut:
         return data
     if len(data) != size:
@@ -419,19 +426,6 @@ def unpacked_message(data: memoryview) -> memoryview:
         return data
     whole = Chunk(0, len(data), packing, _LARGEST_CHUNK, 0, cut=True)  # its size is not stated
     return memoryview(unpacked(bytes(data), whole))
-
-
-@contextmanager
-def _codec_errors() -> Iterator[None]:
-    """Convert the exceptions of the codecs to ours."""
-    try:
-        yield
-    except DamagedChunk:
-        raise
-    except Exception as error:
-        if why_short(error):  # not a fault of the file
-            raise MemoryError(str(error)) from None
-        raise DamagedChunk(str(error)) from None
 
 
 def _inflate(packed: bytes, packing: str, size: int) -> bytes:

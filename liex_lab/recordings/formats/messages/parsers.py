@@ -99,19 +99,6 @@ _FIELD_TYPES = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "
 _SECOND = 10**9
 
 
-def _raw_image(m: Any) -> RawPicture:
-    return RawPicture(_stamp(m), m.frame_id, m.width, m.height, m.encoding, m.step, False, m.data)
-
-
-def _packed_image(m: Any) -> PackedPicture:
-    return PackedPicture(_stamp(m), m.frame_id, m.format, m.data)
-
-
-def _calibration(m: Any) -> Calibration:
-    numbers = map(tuple, (m.D, m.K, m.P))
-    return Calibration(m.frame_id, m.width, m.height, m.distortion_model, *numbers)
-
-
 def _cloud(m: Any) -> PointCloud:
     columns = {
         field.name: (field.offset, _FIELD_TYPES[field.type])
@@ -131,9 +118,22 @@ def _stamp(message: Any) -> int:
 
 
 _FOXGLOVE: dict[str, tuple[Any, Callable[[Any], Message]]] = {
-    "foxglove.RawImage": (RawImage, _raw_image),
-    "foxglove.CompressedImage": (CompressedImage, _packed_image),
-    "foxglove.CameraCalibration": (CameraCalibration, _calibration),
+    "foxglove.RawImage": (
+        RawImage,
+        lambda m: RawPicture(
+            _stamp(m), m.frame_id, m.width, m.height, m.encoding, m.step, False, m.data
+        ),
+    ),
+    "foxglove.CompressedImage": (
+        CompressedImage,
+        lambda m: PackedPicture(_stamp(m), m.frame_id, m.format, m.data),
+    ),
+    "foxglove.CameraCalibration": (
+        CameraCalibration,
+        lambda m: Calibration(
+            m.frame_id, m.width, m.height, m.distortion_model, tuple(m.D), tuple(m.K), tuple(m.P)
+        ),
+    ),
     "foxglove.PointCloud": (PointCloudMessage, _cloud),
 }
 
@@ -285,11 +285,6 @@ def _image(fields: _Fields) -> RawPicture:
     return RawPicture(stamp_ns, frame_id, width, height, encoding, step, big_endian, fields.blob())
 
 
-def _compressed_image(fields: _Fields) -> PackedPicture:
-    stamp_ns, frame_id = fields.header()
-    return PackedPicture(stamp_ns, frame_id, fields.text(), fields.blob())
-
-
 def _camera_info(fields: _Fields) -> Calibration:
     _, frame_id = fields.header()
     height, width = fields.numbers("I", 2)
@@ -323,10 +318,6 @@ def _point_cloud2(fields: _Fields) -> PointCloud:
     return PointCloud(stamp_ns, frame_id, width, height, columns, point_step, row_step, data)
 
 
-def _value(fields: _Fields) -> Statement:
-    return Statement({"value": f"{fields.numbers('f')[0]:.6g}"})  # 0.001 instead of its float32
-
-
 def _text(fields: _Fields) -> Statement:
     """Facts such as "fx=287.9;fy=287.9", or one bare value."""
     text = fields.text()
@@ -334,18 +325,17 @@ def _text(fields: _Fields) -> Statement:
     return Statement(pairs or {"value": text})
 
 
-def _key_value(fields: _Fields) -> Statement:
-    return Statement({fields.text(): fields.text()})
-
-
 _PARSERS: dict[str, Callable[[_Fields], Message]] = {
     "sensor_msgs/Image": _image,
-    "sensor_msgs/CompressedImage": _compressed_image,
+    "sensor_msgs/CompressedImage": lambda fields: PackedPicture(
+        *fields.header(), fields.text(), fields.blob()
+    ),
     "sensor_msgs/CameraInfo": _camera_info,
     "sensor_msgs/PointCloud2": _point_cloud2,
-    "std_msgs/Float32": _value,
+    # 0.001 instead of its float32
+    "std_msgs/Float32": lambda fields: Statement({"value": f"{fields.numbers('f')[0]:.6g}"}),
     "std_msgs/String": _text,
-    "diagnostic_msgs/KeyValue": _key_value,
+    "diagnostic_msgs/KeyValue": lambda fields: Statement({fields.text(): fields.text()}),
 }
 _LAYOUTS: dict[str, type[_Fields]] = {"ros1": _Fields, "cdr": _CdrFields}
 

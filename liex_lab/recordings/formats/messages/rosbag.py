@@ -7,7 +7,7 @@ header of named fields and data; a chunk packs records (none, bz2, lz4).
 
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -19,13 +19,12 @@ from liex_lab.recordings.formats.messages.messages import (
     Chunk,
     DamagedChunk,
     Envelope,
+    IsRelevant,
     MessageFile,
     MessagePlace,
 )
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
-
-IsRelevant = Callable[[Channel], bool]
 
 _VERSION = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
