@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.plan import Plan
-from liex_lab.plan.study import Study, merged
+from liex_lab.plan.study import Study
 
 TWO = """
 name = "two groups"
@@ -126,13 +126,6 @@ def test_a_study_that_is_not_there_is_told(tmp_path: Path) -> None:
     (tmp_path / "study.toml").write_bytes(b"\xff\xfe\0\0")
     with pytest.raises(StudyError, match="TOML"):
         Study.load(tmp_path)
-
-
-def test_settings_are_put_into_one_another() -> None:
-    assert merged({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 5}, "d": {"e": 1}}) == {
-        "a": {"b": 5, "c": 2},
-        "d": {"e": 1},
-    }
 
 
 _WORDS = st.sampled_from(

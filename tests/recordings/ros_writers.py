@@ -5,7 +5,7 @@ our readers.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -214,25 +214,45 @@ def write_ros_mcap(
     sent_ns: times of sending of the images; None: those of logging.
     """
     sent = None if sent_ns is None else iter(sent_ns)
+    packing = {"chunk_size": chunk_size, "compression": compression, "use_chunking": use_chunking}
+    return write_messages(
+        path,
+        (
+            (
+                topic,
+                message.__msgtype__.replace("/msg/", "/") if ros == 1 else message.__msgtype__,
+                "ros1" if ros == 1 else "cdr",
+                log_ns,
+                next(sent) if sent is not None and "Info" not in message.__msgtype__ else log_ns,
+                pack_message(serialised(ros, message)),
+            )
+            for topic, log_ns, message in ros_messages(
+                ros, frames, replace(how or How(), **changes)
+            )
+        ),
+        **packing,
+    )
+
+
+def serialised(ros: int, message: Any) -> bytes:
+    """The bytes of a message of ROS 1 or 2."""
+    pack = store(ros).serialize_ros1 if ros == 1 else store(ros).serialize_cdr
+    return bytes(pack(message, message.__msgtype__))
+
+
+def write_messages(
+    path: Path, messages: Iterable[tuple[str, str, str, int, int, bytes]], **how: Any
+) -> Path:
+    """An MCAP file of messages: topic, schema, encoding, times of logging and sending, bytes."""
     with path.open("wb") as file:
-        writer = McapWriter(
-            file, chunk_size=chunk_size, compression=compression, use_chunking=use_chunking
-        )
-        writer.start(f"ros{ros}")
+        writer = McapWriter(file, **how)
+        writer.start()
         channels: dict[str, int] = {}
-        for topic, log_ns, message in ros_messages(ros, frames, replace(how or How(), **changes)):
-            kind = message.__msgtype__
+        for topic, kind, encoding, log_ns, sent_ns, data in messages:
             if topic not in channels:
-                definition, _ = store(ros).generate_msgdef(kind, ros_version=ros)
-                name = kind.replace("/msg/", "/") if ros == 1 else kind
-                schema = writer.register_schema(name, f"ros{ros}msg", definition.encode())
-                channels[topic] = writer.register_channel(
-                    topic, "ros1" if ros == 1 else "cdr", schema
-                )
-            pack = store(ros).serialize_ros1 if ros == 1 else store(ros).serialize_cdr
-            published = next(sent) if sent is not None and "Info" not in kind else log_ns
-            data = pack_message(bytes(pack(message, kind)))
-            writer.add_message(channels[topic], log_ns, data, published)
+                schema = writer.register_schema(kind, "text", b"")
+                channels[topic] = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channels[topic], log_ns, data, sent_ns)
         writer.finish()
     return path
 

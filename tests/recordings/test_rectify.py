@@ -115,13 +115,6 @@ def test_it_is_lazy_sliceable_and_the_same_again() -> None:
     assert np.isfinite(once).all()
 
 
-def test_problems_found_while_reading_are_told_by_both() -> None:
-    original = recording(BARREL)
-    seen = rectified(original)
-    original.problems.append("frame 3 is damaged")
-    assert seen.problems[-1] == "frame 3 is damaged"
-
-
 def test_the_water_is_undone_once() -> None:
     seen = rectified(recording(), WATER)
     assert rectified(seen, WATER) is seen

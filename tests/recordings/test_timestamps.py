@@ -572,15 +572,6 @@ def test_a_counter_beside_the_times_is_not_taken_for_them(
         assert recording.doubts == []
 
 
-@pytest.mark.parametrize("n", [10, 33, 1000])
-@pytest.mark.parametrize("unit_ns", [10**3, 10**6, 10**9])
-@pytest.mark.parametrize("named", [False, True])
-def test_integers_that_rise_by_one_are_never_times(n: int, unit_ns: int, named: bool) -> None:
-    lines = ["time_ms"] * named + [f"{k + 1} 0" for k in range(n)]
-    found, _, doubts = read("\n".join(lines).encode(), usual_ns=unit_ns)
-    assert found is None or "counts by one: a frame counter, not times" in doubts[0]
-
-
 @pytest.mark.parametrize("step", [8, 16])
 def test_a_counter_alone_gives_the_gaps_at_a_stated_rate_or_a_doubt(
     tmp_path: Path, step: int

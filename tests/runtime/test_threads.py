@@ -9,11 +9,6 @@ import pytest
 from liex_lab.runtime.processes import imported_ahead, in_background, prefetch, side_by_side
 
 
-def test_items_made_ahead_are_the_same_in_the_same_order() -> None:
-    assert list(prefetch(range(7))) == list(range(7))
-    assert list(prefetch([])) == []
-
-
 def test_one_item_is_made_while_the_one_before_it_is_used() -> None:
     made: list[int] = []
     third = threading.Event()

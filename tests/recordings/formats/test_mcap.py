@@ -25,7 +25,6 @@ from foxglove.messages import (
     Vector3,
 )
 from mcap.writer import CompressionType, IndexType
-from mcap.writer import Writer as McapWriter
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -37,7 +36,7 @@ from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.runtime.progress import silent
 from tests.recordings.asking import opened_or_refused, refusal
-from tests.recordings.ros_writers import points_of, write_bag, write_ros_mcap
+from tests.recordings.ros_writers import points_of, write_bag, write_messages, write_ros_mcap
 from tests.recordings.writers import (
     SMALL,
     START_NS,
@@ -325,28 +324,24 @@ def write_json(
     """Foxglove's messages in JSON, with the least that an MCAP file may have: no chunk, no index,
     no summary.
     """
-    with path.open("wb") as file:
-        writer = McapWriter(
-            file,
-            use_chunking=False,
-            index_types=IndexType.NONE,
-            repeat_channels=False,
-            repeat_schemas=False,
-            use_statistics=False,
-            use_summary_offsets=False,
-        )
-        writer.start()
+    written = [
+        (topic, kind, "json", time_ns, time_ns, json.dumps(message).encode())
         for topic, kind, messages in (
             ("/camera/calibration", "foxglove.CameraCalibration", [calibration or {}]),
             ("/camera/depth", schema, contents),
-        ):
-            channel = writer.register_channel(
-                topic, "json", writer.register_schema(kind, "jsonschema", b"{}")
-            )
-            for time_ns, message in zip(even_times(len(messages)), messages, strict=True):
-                writer.add_message(channel, time_ns, json.dumps(message).encode(), time_ns)
-        writer.finish()
-    return path
+        )
+        for time_ns, message in zip(even_times(len(messages)), messages, strict=True)
+    ]
+    return write_messages(
+        path,
+        written,
+        use_chunking=False,
+        index_types=IndexType.NONE,
+        repeat_channels=False,
+        repeat_schemas=False,
+        use_statistics=False,
+        use_summary_offsets=False,
+    )
 
 
 def json_message(k: int, data: bytes, **more: Any) -> dict[str, Any]:

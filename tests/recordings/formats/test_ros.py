@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 
 from liex_lab.optics.camera import Camera, Distortion, Lens
@@ -27,9 +26,10 @@ from tests.recordings.asking import refusal
 from tests.recordings.ros_writers import (
     How,
     ros_messages,
-    store,
+    serialised,
     write_bag,
     write_db3,
+    write_messages,
     write_ros_mcap,
 )
 from tests.recordings.writers import SMALL, START_NS, depth_frames, even_times
@@ -117,21 +117,14 @@ def test_loose_points_need_a_picture_to_be_seen_in(write: Writer) -> None:
         np.testing.assert_allclose(recording.frame(0).depth, STORED[0], atol=1e-3)
 
 
-def test_pictures_come_before_the_clouds_made_of_them(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    with path.open("wb") as file:
-        writer = McapWriter(file)
-        writer.start("ros2")
-        for how in (How(kind="cloud", topics=("/camera/points",)), How(topics=("/camera/depth",))):
-            channels: dict[str, int] = {}
-            for topic, log_ns, message in ros_messages(2, STORED, how):
-                kind = message.__msgtype__
-                if topic not in channels:
-                    schema = writer.register_schema(kind, "ros2msg", b"")
-                    channels[topic] = writer.register_channel(topic, "cdr", schema)
-                data = bytes(store(2).serialize_cdr(message, kind))
-                writer.add_message(channels[topic], log_ns, data, log_ns)
-        writer.finish()
+def test_images_come_before_the_clouds_made_of_them(tmp_path: Path) -> None:
+    clouds, images = How(kind="cloud", topics=("/camera/points",)), How(topics=("/camera/depth",))
+    messages = (
+        (topic, message.__msgtype__, "cdr", log_ns, log_ns, serialised(2, message))
+        for how in (clouds, images)
+        for topic, log_ns, message in ros_messages(2, STORED, how)
+    )
+    path = write_messages(tmp_path / "r.mcap", messages)
     with open_recording(path) as recording:
         np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
     with open_recording(path, topic="/camera/points") as recording:
