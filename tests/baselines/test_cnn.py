@@ -6,19 +6,12 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from liex_lab.baselines._kernels import PATCH
 from liex_lab.baselines.baseline import frames_of, joints_of, patches_of, targets_of
 from liex_lab.estimation.method import METHODS
-from liex_lab.scene.height_maps import in_camera_frame, in_view_frame
+from liex_lab.scene.height_maps import in_camera_frame
 from tests.estimation.toy import toy_mice, training_set
-
-
-@pytest.fixture(scope="module")
-def data():
-    return training_set(toy_mice(6, 5), METHODS["paper"])
 
 
 def drawn(seed: int, step: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -59,14 +52,14 @@ def patch_by_hand(heights: np.ndarray, look: np.ndarray) -> np.ndarray:
     return out
 
 
-@given(seed=st.integers(0, 2**20), step=st.integers(1, 3))
-def test_what_is_said_of_joints_can_be_undone(seed, step):
+@pytest.mark.parametrize(("seed", "step"), [(0, 1), (1, 2), (2, 3)])
+def test_targets_of_joints_can_be_undone(seed, step):
     heights, crop_cameras = drawn(seed, step)
     frames = frames_of(heights, crop_cameras)
     joints = np.random.default_rng(seed).uniform([-200, -150, 400], [200, 150, 1000], (2, 7, 3))
-    told = targets_of(joints, crop_cameras, frames)
-    assert told.shape == (2, 21)
-    np.testing.assert_allclose(joints_of(told, crop_cameras, frames), joints, atol=2e-3)
+    targets = targets_of(joints, crop_cameras, frames)
+    assert targets.shape == (2, 21)
+    np.testing.assert_allclose(joints_of(targets, crop_cameras, frames), joints, atol=2e-3)
 
 
 def test_a_patch_is_what_a_reader_would_cut():
@@ -76,34 +69,6 @@ def test_a_patch_is_what_a_reader_would_cut():
         by_hand = patch_by_hand(heights[k], crop_cameras[k])
         told = np.isfinite(by_hand)
         np.testing.assert_allclose(patches[k][told], by_hand[told], atol=0.05)
-
-
-def test_the_animal_fills_its_patch_and_its_middle_is_grey(data):
-    heights, crop_cameras = data.images.heights, data.images.crop_cameras
-    patches = patches_of(heights, crop_cameras, frames_of(heights, crop_cameras))
-    assert patches.min() == 0.0
-    assert patches.max() <= 255.0
-    for patch in patches:
-        rows, columns = np.nonzero(patch > 0)
-        assert max(np.ptp(rows), np.ptp(columns)) == pytest.approx(PATCH / 1.1, abs=12)
-        assert np.median(patch[patch > 0]) == pytest.approx(
-            127.5, abs=20
-        )  # its outline fades into the background
-
-
-def test_a_camera_of_twice_the_resolution_sees_the_same_patch_and_the_same_joints():
-    heights, crop_cameras = drawn(1, step=1)
-    finer = crop_cameras.copy()
-    finer[:, :4] *= 2
-    finer[:, 14:17] *= 2
-    joints = np.random.default_rng(0).uniform([-50, -50, 500], [50, 50, 700], (2, 4, 3))
-    one, two = frames_of(heights, crop_cameras), frames_of(heights, finer)
-    np.testing.assert_allclose(
-        patches_of(heights, crop_cameras, one), patches_of(heights, finer, two), atol=1e-3
-    )
-    np.testing.assert_allclose(
-        targets_of(joints, crop_cameras, one), targets_of(joints, finer, two), atol=1e-5
-    )
 
 
 def test_a_joint_in_the_middle_of_the_square_at_the_mean_depth_is_zero_and_nearer_is_positive():
@@ -119,19 +84,9 @@ def test_a_joint_in_the_middle_of_the_square_at_the_mean_depth_is_zero_and_neare
     assert told[1, 2] == pytest.approx(10.0 / frames[1, 4])
 
 
-def test_view_and_camera_frame_undo_each_other(data):
-    crop_cameras, points = data.images.crop_cameras, data.truth.positions
-    camera = in_camera_frame(points, crop_cameras)
-    np.testing.assert_allclose(in_view_frame(camera, crop_cameras), points, atol=1e-9)
-    assert (camera[..., 2] > 300).all()
-    np.testing.assert_allclose(
-        in_camera_frame(points[:, 0], crop_cameras), camera[:, 0], atol=1e-12
-    )
-
-
 if find_spec("torch"):  # an extra that the tests do without: see `cnn` in pyproject.toml
 
-    def test_a_small_network_learns_forgets_nothing_on_the_way_to_disk_and_repeats(data, tmp_path):
+    def test_a_small_network_learns_and_is_the_same_after_writing(tmp_path):
         from liex_lab.baselines.baseline import Cnn, CnnPlan, train_cnn
 
         plan = CnnPlan(width=0.125, connected=32, epochs=10)

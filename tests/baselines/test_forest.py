@@ -6,9 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from liex_lab.pipelines.training.pose_model import training_of
 
 from liex_lab.baselines import _kernels as kernels
 from liex_lab.baselines import baseline
@@ -27,7 +24,6 @@ from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
-from liex_lab.simulation.hand.simulator import draw_observed
 from tests.estimation.toy import FLOOR, SCENE, Toy, toy_mice, trained, training_set, unseen
 
 PAPER = METHODS["paper"]
@@ -51,9 +47,8 @@ def true_joints(toy: Toy) -> np.ndarray:
     return FLOOR.T_arena_camera.inverse() @ toy.joints
 
 
-@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
-def test_a_lever_is_how_far_a_small_step_moves_the_joints(animal):
-    skeleton = Skeleton.load(animal)
+def test_a_lever_is_how_far_a_small_step_moves_the_joints():
+    skeleton = Skeleton.load("hand")
     lever, step, home = levers(skeleton), 1e-6, Pose.home(skeleton)
     rest = home.joints(skeleton)
     moved = []
@@ -100,23 +95,8 @@ def test_the_true_coordinates_unfold_to_the_true_pose():
         assert scale == pytest.approx(data.truth.scale[k])
 
 
-def test_a_hand_that_shows_its_palm_is_near_the_pose_that_f2_begins_at():
-    """From an upright start it is turned by half a turn, and F2 would not learn from it."""
-    skeleton = Skeleton.load("hand")
-    turn = training_of("rf", skeleton).plan.home_turn
-    _, turns = draw_observed(np.random.default_rng(0), skeleton, 400)
-    headings = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
-    flat = so3.exp(np.stack([0 * headings, 0 * headings, headings], axis=1))
-    off = [
-        np.linalg.norm(so3.log(np.swapaxes(flat @ start, 1, 2) @ turns), axis=1)
-        for start in (np.eye(3), so3.exp(np.array(turn)))
-    ]
-    assert (off[0] < np.pi / 2).mean() < 0.25
-    assert (off[1] < np.pi / 2).mean() > 0.7
-
-
-@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (3.1416, 0.0, 0.0), (0.3, -0.2, 2.0)])
-def test_a_body_with_a_turned_home_has_the_same_poses(turn):
+def test_a_body_with_a_turned_home_has_the_same_poses():
+    turn = (0.3, -0.2, 2.0)
     skeleton = Skeleton.load("hand")
     rng = np.random.default_rng(1)
     root = SE3.exp(rng.normal(0, 1, (6, 6)) * [1, 1, 1, 40, 40, 40])
@@ -128,7 +108,7 @@ def test_a_body_with_a_turned_home_has_the_same_poses(turn):
     np.testing.assert_allclose(again, joints, atol=1e-9)
 
 
-@given(n_points=st.integers(1, 40), phase=st.floats(0.0, 0.999))
+@pytest.mark.parametrize(("n_points", "phase"), [(1, 0.0), (7, 0.5), (40, 0.99)])
 def test_points_lie_on_the_animal_and_are_spread_over_all_of_it(n_points, phase):
     data = training_set(toy_mice(1, 3), PAPER)
     heights, look = data.images.heights[0], data.images.crop_cameras[0]
@@ -145,7 +125,7 @@ def test_points_lie_on_the_animal_and_are_spread_over_all_of_it(n_points, phase)
     assert np.abs(np.diff(ranks) - (heights > 0).sum() / n_points).max(initial=0.0) <= 1.0
 
 
-@given(heading=st.floats(-np.pi, np.pi), n_wrong=st.integers(0, 8))
+@pytest.mark.parametrize(("heading", "n_wrong"), [(-3.1, 0), (0.4, 4), (3.14, 8)])
 def test_the_heading_is_that_of_the_majority(heading, n_wrong):
     rng = np.random.default_rng(n_wrong)
     angles = np.concatenate(
@@ -155,7 +135,8 @@ def test_the_heading_is_that_of_the_majority(heading, n_wrong):
     assert abs(np.angle(np.exp(1j * (kernels.heading_of(votes) - heading)))) < 0.15
 
 
-def test_it_measures_mice_that_it_has_not_seen(grown):
+@pytest.mark.nightly
+def test_it_measures_unknown_mice(grown):
     toy = unseen()
     guesses = grown.estimate(toy.depths, SCENE, grown.find_size(toy.depths, SCENE))
     assert guesses.found.all()
@@ -167,6 +148,7 @@ def test_it_measures_mice_that_it_has_not_seen(grown):
     assert (error < 12.0).mean() > 0.75
 
 
+@pytest.mark.nightly
 def test_one_core_gives_what_two_give_and_a_second_training_the_same_forest(grown):
     toy = toy_mice(40, 4)
     one, two = (
@@ -182,38 +164,24 @@ def test_one_core_gives_what_two_give_and_a_second_training_the_same_forest(grow
     assert a.to_bytes() == b.to_bytes()
 
 
-def test_bones_keep_their_proportions(grown):
-    toy = toy_mice(20, 4)
-    joints, home = (
-        grown.estimate(toy.depths, SCENE, 1.0).joints,
-        np.linalg.norm(toy.skeleton.offsets[1:], axis=-1),
-    )
-    bones = np.linalg.norm(np.diff(joints, axis=1), axis=-1) / home
-    np.testing.assert_allclose(bones, bones[:, :1] * np.ones(4), rtol=1e-6)
-
-
-def test_a_frame_without_an_animal_is_nan_and_its_neighbours_are_not(grown):
-    depths = toy_mice(3, 4).depths.copy()
-    depths[1] = FLOOR.depth(depths.shape[2], depths.shape[1])
-    guesses = grown.estimate(depths, SCENE, 1.0)
-    assert guesses.found.tolist() == [True, False, True]
-    assert np.isnan(guesses.joints[1]).all()
-    assert np.isfinite(guesses.joints[[0, 2]]).all()
-
-
-def test_a_file_gives_the_forest_back_and_a_damaged_one_is_told_in_a_sentence(grown, tmp_path):
+@pytest.mark.nightly
+def test_a_file_gives_the_forest_back_and_a_damaged_one_is_refused(grown, tmp_path):
     path, toy = tmp_path / "rf.npz", toy_mice(5, 4)
+    toy.depths[1] = FLOOR.depth(*toy.depths.shape[:0:-1])  # no animal
     path.write_bytes(grown.to_bytes())
     again = RegressionForest.load(path, grown.skeleton, grown.plan)
     np.testing.assert_array_equal(
         again.estimate(toy.depths, SCENE, 1.0).joints, grown.estimate(toy.depths, SCENE, 1.0).joints
     )
+    found = again.estimate(toy.depths, SCENE, 1.0)
+    assert found.found.tolist() == [True, False, True, True, True]
+    assert np.isnan(found.joints[1]).all()
     path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ModelError, match="train again") as told:
+    with pytest.raises(ModelError, match="train again"):
         RegressionForest.load(path, grown.skeleton, grown.plan)
-    assert "\n" not in str(told.value)
 
 
+@pytest.mark.nightly
 def test_the_plain_mean_is_the_mean_of_all_candidates():
     estimator = PoseEstimator(trained("paper").model)
     toy = toy_mice(8, 4)

@@ -3,14 +3,12 @@ limits.
 """
 
 import numpy as np
-import pytest
 
 from liex_lab.body import Pose, Skeleton
-from liex_lab.body.pose import Fit, KinematicTree, _after_step, _jacobian, fit_poses
+from liex_lab.body.pose import fit_poses
 from liex_lab.geometry import SE3, so3
 
 HAND = Skeleton.load("hand")
-FREE = KinematicTree.of(HAND).free
 
 
 def hands(n: int, seed: int, share: float = 0.8) -> Pose:
@@ -31,16 +29,16 @@ def near(pose: Pose, seed: int) -> Pose:
 
 
 def test_poses_are_found_again_from_all_their_joints() -> None:
-    pose = hands(40, 0)
+    pose = hands(8, 0)
     fit = fit_poses(HAND, pose.joints(HAND), np.eye(HAND.n_joints), near(pose, 1))
     assert fit.residual_mm.mean(axis=1).max() < 0.5
     np.testing.assert_allclose(fit.pose.scale, pose.scale, rtol=0.01)
 
 
 def test_joints_stay_within_their_limits_and_bones_as_long_as_asked() -> None:
-    pose = hands(20, 2, share=1.0)
+    pose = hands(6, 2, share=1.0)
     stretched = pose.joints(HAND) * 1.3
-    fit: Fit = fit_poses(HAND, stretched, np.eye(HAND.n_joints), near(pose, 3), keep_scale=True)
+    fit = fit_poses(HAND, stretched, np.eye(HAND.n_joints), near(pose, 3), keep_scale=True)
     np.testing.assert_array_equal(fit.pose.scale, 1.0)
     low, high = HAND.limits[..., 0], HAND.limits[..., 1]
     assert (fit.pose.angles[:, 1:] >= low[1:] - 1e-12).all()
@@ -56,18 +54,3 @@ def test_what_points_leave_open_stays_at_rest() -> None:
         HAND, pose.joints(HAND)[:, :3], weights, Pose(pose.root, start.angles, pose.scale)
     )
     assert np.abs(fit.pose.angles).max() < 1e-3
-
-
-@pytest.mark.parametrize("seed", [5, 6])
-def test_the_slopes_are_those_of_small_steps(seed: int) -> None:
-    pose, weights, step = hands(3, seed), np.eye(HAND.n_joints), 1e-6
-    slope = _jacobian(HAND, pose, weights, FREE)
-    low, high = np.full((2, HAND.n_joints, 3), np.array([-9.0, 9.0])[:, None, None])
-    for c in range(slope.shape[-1]):
-        by = np.zeros((3, slope.shape[-1]))
-        by[:, c] = step
-        ahead, back = (
-            _after_step(pose, sign * by, FREE, low, high).joints(HAND) for sign in (1.0, -1.0)
-        )
-        numeric = (ahead - back).reshape(3, -1) / (2.0 * step)
-        np.testing.assert_allclose(slope[..., c], numeric, atol=2e-4)

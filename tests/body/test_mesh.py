@@ -2,7 +2,6 @@
 bones.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,6 @@ from liex_lab.body.variation import vary_body
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
-from liex_lab.simulation import training_patches
-from liex_lab.simulation.simulator import world_of
 
 SNAKE = Skeleton.load(find_sample("snake.toml"))
 FLESH = Surface.of(SNAKE)
@@ -76,16 +73,6 @@ def test_a_bent_body_lies_where_the_capsules_lie(meshed):
         assert off.max() < 8.0  # at the bends, where a vertex follows two bones
 
 
-def test_bodies_move_rigidly_and_grow_with_scale(meshed):
-    surface, pose = Surface.of(meshed), winding(4)
-    T = SE3.exp(np.array([0.3, -0.2, 1.0, 5.0, 6.0, 7.0]))
-    moved = surface.vertices(pose.moved(T))
-    np.testing.assert_allclose(moved, T @ surface.vertices(pose), atol=1e-9)
-    home = Pose.home(meshed)
-    doubled = replace(home, scale=np.array(2.0))
-    np.testing.assert_allclose(surface.vertices(doubled), 2.0 * surface.vertices(home), atol=1e-9)
-
-
 def test_individuals_differ_in_girth_and_not_in_length(meshed):
     n = 200
     body = vary_body(np.random.default_rng(3), meshed, "augmented", n)
@@ -94,13 +81,6 @@ def test_individuals_differ_in_girth_and_not_in_length(meshed):
     length, width = np.ptp(vertices[..., 0], axis=1), np.ptp(vertices[..., 1], axis=1)
     assert length.std() / length.mean() < 0.01
     assert 0.05 < width.std() / width.mean() < 0.5
-
-
-def test_training_patches_show_the_mesh(meshed, monkeypatch):
-    monkeypatch.setattr(training_patches, "BLOCK", 64)
-    (windows,) = world_of(meshed).training_blocks(3, 1, first=0, family="augmented", window_px=120)
-    stands = (windows.depth > 0) & (windows.background - windows.depth > 4.0)
-    assert stands.reshape(len(stands), -1).any(axis=1).mean() > 0.95
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,6 @@ import pytest
 
 from liex_lab.body.pose import KinematicTree, PlacedPose, Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation.method import METHODS
-from liex_lab.estimation.model import ErrorCalibration
-from liex_lab.estimation.scoring import choose
 from liex_lab.geometry import SE3, so3
 
 MOUSE = Skeleton.load("mouse")
@@ -31,26 +28,6 @@ def test_a_placed_pose_and_some_of_it_have_the_frames_of_the_pose_to_the_bit(row
         np.testing.assert_array_equal(kept.frames(MOUSE).rotation, frames.rotation)
         np.testing.assert_array_equal(kept.frames(MOUSE).translation, frames.translation)
         np.testing.assert_array_equal(kept.joints(MOUSE), plain.joints(MOUSE))
-
-
-def test_a_placed_pose_in_another_frame_is_placed_anew():
-    pose = bent(4)
-    T = SE3(so3.exp(np.array([0.1, -0.7, 0.4])), np.array([10.0, -20.0, 700.0]))
-    moved = pose.placed(MOUSE).moved(T)
-    assert not isinstance(moved, PlacedPose)
-    np.testing.assert_array_equal(moved.joints(MOUSE), pose.moved(T).joints(MOUSE))
-    np.testing.assert_allclose(moved.joints(MOUSE), T @ pose.joints(MOUSE), atol=1e-9)
-
-
-def test_chosen_poses_keep_the_frames_of_their_joints():
-    home = Pose.home(MOUSE, 3, 4).frames(MOUSE)
-    scores = np.random.default_rng(1).uniform(1, 9, (3, 4))
-    picked = choose(
-        MOUSE, METHODS["default"], ErrorCalibration(), 1.0, home.rotation, home.translation, scores
-    )
-    assert isinstance(picked.pose, PlacedPose)
-    plain = Pose(picked.pose.root, picked.pose.angles, picked.pose.scale)
-    np.testing.assert_array_equal(picked.pose.frames(MOUSE).rotation, plain.frames(MOUSE).rotation)
 
 
 @pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])

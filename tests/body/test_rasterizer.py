@@ -22,7 +22,7 @@ def random_pose(animal: str, seed: int, z_mm: float) -> tuple[Surface, Pose]:
     return Surface.of(skeleton), Pose(root, angles, np.array(1.2))
 
 
-@pytest.mark.parametrize(("animal", "z_mm"), [("mouse", 300.0), ("hand", 900.0), ("fish", 150.0)])
+@pytest.mark.parametrize(("animal", "z_mm"), [("mouse", 300.0), ("hand", 900.0)])
 def test_pictures_agree_with_a_ray_through_every_pixel(animal: str, z_mm: float) -> None:
     surface, pose = random_pose(animal, 1, z_mm)
     window = (14, 10, 32, 30)
@@ -33,14 +33,6 @@ def test_pictures_agree_with_a_ray_through_every_pixel(animal: str, z_mm: float)
     # a ray along an edge may go either way
     assert ((fast > 0) != (slow > 0)).mean() < 1e-3
     np.testing.assert_allclose(fast[both], slow[both], rtol=3e-6)
-
-
-def test_a_window_is_that_part_of_the_picture() -> None:
-    surface, pose = random_pose("mouse", 3, 300.0)
-    mesh = surface.vertices(pose)
-    whole = render_mesh(mesh, surface.faces, CAMERA)
-    part = render_mesh(mesh, surface.faces, CAMERA, (20, 10, 30, 25))
-    np.testing.assert_array_equal(part, whole[10:35, 20:50])
 
 
 def test_depth_across_a_tilted_triangle_is_perspective_correct() -> None:
@@ -54,14 +46,6 @@ def test_depth_across_a_tilted_triangle_is_perspective_correct() -> None:
         depth[rows, columns], corners[0] @ normal / (rays @ normal), rtol=1e-6
     )
     assert len(rows) > 500
-
-
-def test_both_sides_of_a_triangle_are_seen() -> None:
-    corners = np.array([[-20.0, -20.0, 300.0], [20.0, -20.0, 300.0], [0.0, 30.0, 320.0]])
-    front = render_mesh(corners, np.array([[0, 1, 2]], np.int32), CAMERA)
-    back = render_mesh(corners, np.array([[0, 2, 1]], np.int32), CAMERA)
-    assert (front > 0).sum() > 100
-    np.testing.assert_allclose(front, back, rtol=1e-6)
 
 
 def test_what_is_behind_the_camera_is_not_drawn() -> None:

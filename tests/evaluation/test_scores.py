@@ -12,7 +12,6 @@ from liex_lab.evaluation.scores import (
     Tally,
     interval95,
     matched,
-    rank_correlation,
     tracking_figures,
 )
 from liex_lab.simulation.corruptions import Event
@@ -60,38 +59,7 @@ def test_the_summary_agrees_with_hand_computed_numbers():
     assert both.summary()["p95_joint_error_mm"] > expected["p95_joint_error_mm"]
 
 
-def test_the_summary_of_a_recording_without_a_measured_frame_has_the_same_names():
-    nothing = np.full((4, 3, 3), np.nan)
-    errors = PoseErrors.compare(
-        nothing, line(0, 0, 0, 0), 2, np.full(4, np.nan), np.array([0.5, 2.0])
-    )
-    summary = errors.summary()
-    assert list(summary) == list(five_frames().summary())
-    assert summary.pop("lost_rate") == 1.0
-    assert set(summary.values()) == {None}
-
-
-@pytest.mark.parametrize(
-    ("b", "rho"), [([1, 4, 9, 16], 1.0), ([16, 9, 4, 1], -1.0), ([2, 1, 4, 3], 0.6)]
-)
-def test_rank_correlation_depends_on_order_alone(b, rho):
-    found = rank_correlation(np.array([1.0, 2.0, 3.0, 4.0]), np.array(b, float))
-    assert found == pytest.approx(rho)
-
-
 # intervals by bootstrap over recordings
-
-
-def test_the_interval_of_a_mean_holds_the_truth_about_as_often_as_it_says():
-    held = 0
-    rng = np.random.default_rng(4)
-    for _ in range(60):
-        of_recording = rng.normal(3.0, 0.8, 40)
-        recording = np.repeat(np.arange(40), 20)
-        error = of_recording[recording] + rng.normal(0.0, 0.3, len(recording))
-        low, high = interval95(error, recording, np.mean, 300) or (0.0, 0.0)
-        held += low <= 3.0 <= high
-    assert held / 60 == pytest.approx(0.95, abs=0.08)
 
 
 def test_frames_of_one_recording_do_not_count_as_many_animals():

@@ -28,7 +28,7 @@ def mouse() -> mouse_acts.MouseActor:
     )
 
 
-def measured(fish: fish_acts.FishActor, word: str, n: int = 15) -> dict[str, np.ndarray]:
+def measured(fish: fish_acts.FishActor, word: str, n: int = 8) -> dict[str, np.ndarray]:
     """Of n actions: length s, mean speed and climb in lengths (a second), net turn and largest bend
     in degrees.
     """
@@ -61,7 +61,7 @@ def test_the_nine_actions_of_a_fish_follow_their_definitions(fish: fish_acts.Fis
 def test_an_uncut_recording_stays_in_the_water_holds_every_action_and_nameless_stretches(
     fish,
 ) -> None:
-    motion = fish.uncut(np.random.default_rng(1), 240.0)
+    motion = fish.uncut(np.random.default_rng(1), 120.0)
     assert fish.fits(motion.position[::7], motion.heading[::7]) or (
         np.ptp(motion.position[:, 2]) < 112.0
     )
@@ -73,7 +73,7 @@ def test_an_uncut_recording_stays_in_the_water_holds_every_action_and_nameless_s
 
 
 def test_a_mouse_turns_to_its_own_side_rears_at_walls_and_stays_in_its_box(mouse) -> None:
-    motion = mouse.uncut(np.random.default_rng(4), 300.0)
+    motion = mouse.uncut(np.random.default_rng(4), 200.0)
     assert set(motion.word) == {"", *mouse_acts.ACTIONS}
     assert (np.abs(motion.position[:, :2]) < mouse.half).all()
     edges = np.flatnonzero(np.diff(motion.act)) + 1
@@ -92,17 +92,3 @@ def test_a_mouse_turns_to_its_own_side_rears_at_walls_and_stays_in_its_box(mouse
         np.median(speed[motion.word == "run"]) > 250 > np.median(speed[motion.word == "walk"]) > 50
     )
     assert np.median(speed[motion.word == "freeze"]) < 5
-
-
-def test_a_reared_mouse_has_its_nose_high(mouse) -> None:
-    rng, species = np.random.default_rng(5), MouseSpecies()
-    motion = mouse.uncut(rng, 120.0)
-    rows = motion.at(10.0)
-    pose, _ = mouse_acts.mouse_poses(
-        rng, species, motion, rows, 1.1, species.shapes(rng, "train", 1)
-    )
-    z = pose.joints(species.skeleton)[..., 2]
-    raised = (z[:, -1] - z[:, 0]) / (1.1 * species.skeleton.length)
-    reared = np.char.startswith(motion.word[rows], "rear")
-    assert np.quantile(raised[reared], 0.75) > 0.5
-    assert np.quantile(raised[motion.word[rows] == "walk"], 0.95) < 0.25

@@ -9,10 +9,9 @@ import pytest
 from liex_lab.body import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings.formats.images.nyu import N_FIRST_PERSON, NyuReference
-from liex_lab.simulation.hand import simulator
+from liex_lab.runtime.processes import threads
 from liex_lab.simulation.hand.simulator import HandSimulator, find_reference
-from liex_lab.simulation.simulator import world_of
-from liex_lab.simulation.training_patches import TrainingPatches
+from liex_lab.simulation.training_patches import PER_SESSION, TrainingPatches
 
 HAND = Skeleton.load("hand")
 
@@ -23,14 +22,10 @@ def block() -> TrainingPatches:
     return windows
 
 
-def test_the_world_of_a_hand_is_its_own() -> None:
-    assert isinstance(world_of(HAND), HandSimulator)
-    assert "NYU" in world_of(HAND).sources
-
-
 def test_blocks_are_the_same_bits_on_one_core_and_on_two_and_in_any_order() -> None:
     world = HandSimulator(HAND)
-    first, second = world.training_blocks(5, 2, parallel=False)
+    with threads(False):
+        first, second = world.training_blocks(5, 2)
     (again,) = world.training_blocks(5, 1, first=1)
     for name in ("depth", "joints_mm", "angles", "origin"):
         np.testing.assert_array_equal(getattr(first, name), getattr(block(), name))
@@ -60,8 +55,8 @@ def test_poses_and_joints_are_of_one_hand() -> None:
     own = np.linalg.norm(windows.joints_mm[:, 1:] - windows.joints_mm[:, HAND.parents[1:]], axis=-1)
     home = np.linalg.norm(HAND.offsets[1:], axis=-1) * windows.scale[:, None]
     assert np.abs(np.log(own / home)).max() < 0.45  # people differ, but not without bounds
-    for session in np.unique(windows.session):
-        rows = windows.session == session
+    for start in range(0, len(windows), PER_SESSION):
+        rows = slice(start, start + PER_SESSION)
         assert np.ptp(windows.spine_mm[rows]) == 0.0
         bones = own[rows] / windows.scale[rows][:, None]
         assert (np.ptp(bones, axis=0) < 1e-9).all()
@@ -80,7 +75,15 @@ def test_splits_are_fixed_and_their_people_differ() -> None:
         world.test_split("soft")
 
 
-def test_with_the_reference_test_postures_are_the_second_persons(reference_data: Path) -> None:
+def test_with_the_reference_test_postures_are_the_second_persons(
+    reference_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in (reference_data / "hand_nyu", tmp_path):
+        monkeypatch.setenv("LIEX_NYU", str(folder))
+        if folder != tmp_path:
+            assert find_reference() == folder
+    with pytest.raises(LiexError, match=r"LIEX_NYU should name a folder with nyu_test_14joints"):
+        find_reference()
     world = HandSimulator(HAND, reference_data / "hand_nyu")
     assert f"from {N_FIRST_PERSON + 1} on" in world.protocol
     assert "statistics" in HandSimulator(HAND).protocol
@@ -97,25 +100,6 @@ def test_with_the_reference_test_postures_are_the_second_persons(reference_data:
     scaled = known * session.spine_mm / HAND.length / 0.91
     off = np.abs(shape[:, None] - scaled[None]).mean(axis=(2, 3)).min(axis=1)
     assert np.median(off) < 6.0  # each has its model among the labelled frames
-
-
-def test_the_labels_are_looked_for_in_one_place_whatever_folder_a_command_runs_in(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    beside = tmp_path / "shared" / "data" / "hand_nyu"
-    beside.mkdir(parents=True)
-    (beside / "nyu_test_14joints.npz").touch()
-    monkeypatch.delenv("LIEX_NYU", raising=False)
-    monkeypatch.chdir(tmp_path)  # what lies in the current folder does not count
-    for repository, found in ((tmp_path / "far" / "code", None), (tmp_path / "code", beside)):
-        monkeypatch.setattr(simulator, "_REPOSITORY", repository)
-        assert find_reference() == found
-    monkeypatch.setattr(simulator, "_REPOSITORY", tmp_path / "far" / "code")
-    monkeypatch.setenv("LIEX_NYU", str(beside))
-    assert find_reference() == beside
-    monkeypatch.setenv("LIEX_NYU", str(tmp_path))
-    with pytest.raises(LiexError, match=r"LIEX_NYU should name a folder with nyu_test_14joints"):
-        find_reference()
 
 
 def test_gestures_flow() -> None:

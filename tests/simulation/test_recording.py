@@ -7,6 +7,7 @@ from liex_lab.body import Pose, Skeleton
 from liex_lab.body.shape import Surface
 from liex_lab.errors import LiexError
 from liex_lab.runtime.processes import threads
+from liex_lab.simulation.hand.simulator import NYU_SENSOR
 from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.pose_prior import KINDS, sample_postures
 from liex_lab.simulation.recording import SEALED, SPLITS, SyntheticSession, split_of
@@ -158,11 +159,11 @@ def test_splits_are_fixed_halved_between_sensors_and_apart() -> None:
 @pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
 def test_other_cameras_have_a_focal_length_outside_the_training(animal: str) -> None:
     world = world_of(Skeleton.load(animal))
-    focal = np.unique(next(world.training_blocks(5, 1)).intrinsics[:, 0])
+    sensors = world.species.sensors if isinstance(world, BodySimulator) else (NYU_SENSOR, *SENSORS)
     others = {r.camera.fx for r in world.test_split("other-camera", n_sessions=2)}
     for whole in others:
-        for learned in (focal, focal * 2.0):  # a light field is read at every second pixel
-            assert np.abs(np.log(learned / whole)).min() > 0.06
+        for sensor in sensors:  # training varies the focal length by 3 %
+            assert abs(np.log(sensor.camera.fx / whole)) > 0.09
     assert others != {r.camera.fx for r in world.test_split("clean", n_sessions=2)}
 
 

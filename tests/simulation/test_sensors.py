@@ -98,12 +98,6 @@ def test_a_kinect_mixes_depths_at_an_outline_and_a_primesense_does_not() -> None
     assert time_of_flight > 20 > structured
 
 
-def test_erosion_strips_a_pixel_off_the_animal() -> None:
-    quiet = {"NOISE": 0.0, "FLYING": 0.0, "BIAS": 0.0, "LUMPS": 0.0}
-    outs = [sensed(KINECT_V2_SENSOR, *block(20, 40), EROSION=px, **quiet) for px in (0, 1)]
-    assert [int(((out > 0) & (out < 850)).sum()) for out in outs] == [400, 324]
-
-
 # the light-field camera
 
 
