@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.evaluation.scores import Followed, MeasuredIndividual
 from liex_lab.recordings.formats.images.nyu import POINTS
-from liex_lab.simulation.recording import TrueRecording
-from liex_lab.simulation.scenes.stage import TrueAnimal
+from liex_lab.simulation.recording import TrueAnimal, TrueRecording
 from liex_lab.simulation.simulator import TestSequence
 
 Array = NDArray[np.float64]

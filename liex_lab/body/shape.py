@@ -17,7 +17,7 @@ from liex_lab.body import _rasterizer_kernels as rasterizer_kernels
 from liex_lab.body import _skinning_kernels as skinning_kernels
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import LiexError, one_line
+from liex_lab.errors import LiexError, one_line, refuse
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.kernels import kernel
@@ -86,11 +86,14 @@ class BodyShape(Body):
             LiexError: the joints are not one chain, or the table is incomplete.
         """
         table = skeleton.surface
-        if not skeleton.is_chain:
-            raise LiexError(
+        refuse(
+            LiexError,
+            (
+                not skeleton.is_chain,
                 f"the [surface] of '{skeleton.name}' has stations, but its joints are not one "
-                "chain, each the parent of the next; give radii_mm instead"
-            )
+                "chain, each the parent of the next; give radii_mm instead",
+            ),
+        )
         try:
             width = np.array(table["half_width_mm"], float)
             height = np.array(table["half_height_mm"], float)
@@ -104,11 +107,14 @@ class BodyShape(Body):
             raise LiexError(
                 f"the [surface] of the skeleton '{skeleton.name}' is incomplete: {error}"
             ) from None
-        if not len(width) == len(height) == len(table["stations"]) >= 4:
-            raise LiexError(
+        refuse(
+            LiexError,
+            (
+                not len(width) == len(height) == len(table["stations"]) >= 4,
                 f"the [surface] of '{skeleton.name}' needs equally many stations, half_width_mm "
-                "and half_height_mm, at least 4"
-            )
+                "and half_height_mm, at least 4",
+            ),
+        )
         return BodyShape(
             width, height, np.array(2.0), np.array(blobs, float).reshape(-1, 6), tail, np.array(0.5)
         )
@@ -154,12 +160,15 @@ class Capsules(Body):
             LiexError: there is not one positive radius for each joint, or a capsule is invalid.
         """
         radii = np.array(skeleton.surface.get("radii_mm", []), float)
-        if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
-            raise LiexError(
+        refuse(
+            LiexError,
+            (
+                radii.shape != (skeleton.n_joints,) or not (radii > 0).all(),
                 f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each "
                 f"of its {skeleton.n_joints} joints, or stations with half_width_mm and "
-                "half_height_mm"
-            )
+                "half_height_mm",
+            ),
+        )
         bones = np.array(skeleton.edges, np.int64).reshape(-1, 2)
         more = Capsules.listed(skeleton, PARTS[0])
         return Capsules(
@@ -229,24 +238,37 @@ def _parsed(
 ) -> tuple[list[int], list[list[float]], list[float]]:
     """Joints, offsets and radii of one [[surface.capsules]] or [[surface.beyond]]."""
     where = f"the [[surface.{part}]] of '{skeleton.name}'"
-    if not isinstance(table, dict) or not set(table) <= _KEYS:
-        raise LiexError(f"{where} have the keys {', '.join(sorted(_KEYS))}, got {table}")
+    refuse(
+        LiexError,
+        (
+            not isinstance(table, dict) or not set(table) <= _KEYS,
+            f"{where} have the keys {', '.join(sorted(_KEYS))}, got {table}",
+        ),
+    )
     names = [table.get("from"), table.get("to")]
     for name in names:
-        if name not in skeleton.names:
-            raise LiexError(f"{where} connect two joints, but there is no joint {name!r}")
+        refuse(
+            LiexError,
+            (
+                name not in skeleton.names,
+                f"{where} connect two joints, but there is no joint {name!r}",
+            ),
+        )
     offsets = [table.get("from_mm", [0.0] * 3), table.get("to_mm", [0.0] * 3)]
     radii = table.get("radii_mm", [])
-    if not (
-        _numbers(offsets[0], 3)
-        and _numbers(offsets[1], 3)
-        and _numbers(radii, 2)
-        and min(radii) > 0
-    ):
-        raise LiexError(
+    refuse(
+        LiexError,
+        (
+            not (
+                _numbers(offsets[0], 3)
+                and _numbers(offsets[1], 3)
+                and _numbers(radii, 2)
+                and min(radii) > 0
+            ),
             f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, "
-            f"got {table}"
-        )
+            f"got {table}",
+        ),
+    )
     return [skeleton.names.index(name) for name in names], offsets, radii
 
 
@@ -389,20 +411,21 @@ class MeshBody(Body):
         table = skeleton.surface
         vertices = np.array(table["vertices_mm"], float)
         faces = np.array(table["faces"], np.int64)
-        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.isfinite(vertices).all():
-            raise LiexError(
-                f"the [surface] of '{skeleton.name}' needs vertices_mm, finite triples of mm"
-            )
-        if (
-            faces.ndim != 2
-            or faces.shape[1:] != (3,)
-            or faces.min() < 0
-            or faces.max() >= len(vertices)
-        ):
-            raise LiexError(
+        refuse(
+            LiexError,
+            (
+                vertices.ndim != 2 or vertices.shape[1:] != (3,) or not np.isfinite(vertices).all(),
+                f"the [surface] of '{skeleton.name}' needs vertices_mm, finite triples of mm",
+            ),
+            (
+                faces.ndim != 2
+                or faces.shape[1:] != (3,)
+                or faces.min() < 0
+                or faces.max() >= len(vertices),
                 f"the [surface] of '{skeleton.name}' needs faces, triples of numbers of its "
-                "vertices"
-            )
+                "vertices",
+            ),
+        )
         home = Pose.home(skeleton).frames(skeleton)
         ends = np.arange(1, skeleton.n_joints)
         carriers = skeleton.parents[ends]

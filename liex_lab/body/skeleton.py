@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError, how_to_install
+from liex_lab.errors import LiexError, how_to_install, refuse
 from liex_lab.geometry import so3
 from liex_lab.runtime.text_files import read_toml
 
@@ -79,29 +79,39 @@ class CameraView:
             LiexError: an unknown key, or a value out of its range.
         """
         keys = CameraView.__annotations__
-        if not isinstance(table, dict):
-            raise LiexError(f"{origin}: [view] is a table, got {table!r}")
+        refuse(
+            LiexError, (not isinstance(table, dict), f"{origin}: [view] is a table, got {table!r}")
+        )
         for key in table:
-            if key not in keys:
-                raise LiexError(
-                    f"{origin}: [view] has an unknown key '{key}'; use {', '.join(keys)}"
-                )
+            refuse(
+                LiexError,
+                (
+                    key not in keys,
+                    f"{origin}: [view] has an unknown key '{key}'; use {', '.join(keys)}",
+                ),
+            )
         for key, choices in (("foreground", FOREGROUNDS), ("frame", VIEWS)):
             value = table.get(key, choices[0])
-            if value not in choices:
-                raise LiexError(
-                    f"{origin}: [view] {key} is one of {', '.join(choices)}, got {value!r}"
-                )
-        area = table.get("area", list(_AREA))
-        if not (
-            isinstance(area, list)
-            and [_is_number(a) for a in area] == [True, True]
-            and 0 < area[0] < area[1]
-        ):
-            raise LiexError(
-                f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got "
-                f"{area}"
+            refuse(
+                LiexError,
+                (
+                    value not in choices,
+                    f"{origin}: [view] {key} is one of {', '.join(choices)}, got {value!r}",
+                ),
             )
+        area = table.get("area", list(_AREA))
+        refuse(
+            LiexError,
+            (
+                not (
+                    isinstance(area, list)
+                    and [_is_number(a) for a in area] == [True, True]
+                    and 0 < area[0] < area[1]
+                ),
+                f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got "
+                f"{area}",
+            ),
+        )
         lengths = {
             "behind_mm": _BEHIND_MM * relative_size,
             "smooth_mm": _SMOOTH_MM * relative_size,
@@ -109,8 +119,13 @@ class CameraView:
         }
         for key, usual in lengths.items():
             value = table.get(key, usual)
-            if not (_is_number(value) and value > 0):
-                raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
+            refuse(
+                LiexError,
+                (
+                    not (_is_number(value) and value > 0),
+                    f"{origin}: [view] {key} is a positive number of mm, got {value!r}",
+                ),
+            )
             lengths[key] = float(value)
         stated = {key: table[key] for key in ("frame", "foreground") if key in table}
         return CameraView(
@@ -203,33 +218,54 @@ class Skeleton:
         """
         joints = table.get("joints")
         surface = table.get("surface", {})
-        if not isinstance(table.get("name"), str) or not isinstance(joints, list) or not joints:
-            raise LiexError(f"{origin}: a skeleton needs a name and at least one [[joints]] table")
-        if not isinstance(surface, dict):
-            raise LiexError(f"{origin}: [surface] is a table, got {surface!r}")
+        refuse(
+            LiexError,
+            (
+                not isinstance(table.get("name"), str)
+                or not isinstance(joints, list)
+                or not joints,
+                f"{origin}: a skeleton needs a name and at least one [[joints]] table",
+            ),
+            (not isinstance(surface, dict), f"{origin}: [surface] is a table, got {surface!r}"),
+        )
         rows = [_parsed_joint(joint, k, origin) for k, joint in enumerate(joints)]
         names, named_parents, offset, rest, free, limits_deg = zip(*rows, strict=True)
-        if named_parents[0]:
-            raise LiexError(
-                f"{origin}: the first joint is the base and has no parent, got '{named_parents[0]}'"
-            )
+        refuse(
+            LiexError,
+            (
+                named_parents[0],
+                f"{origin}: the first joint is the base and has no parent, got "
+                f"'{named_parents[0]}'",
+            ),
+        )
         for k, parent in enumerate(named_parents[1:], start=1):
-            if parent not in names[:k]:
-                raise LiexError(
+            refuse(
+                LiexError,
+                (
+                    parent not in names[:k],
                     f"{origin}: the parent '{parent}' of '{names[k]}' must be a joint listed "
-                    "before it"
-                )
+                    "before it",
+                ),
+            )
         parents = [-1, *(names.index(parent) for parent in named_parents[1:])]
-        if len(set(names)) != len(names):
-            raise LiexError(f"{origin}: two joints have the same name; every joint needs its own")
+        refuse(
+            LiexError,
+            (
+                len(set(names)) != len(names),
+                f"{origin}: two joints have the same name; every joint needs its own",
+            ),
+        )
         axes = np.array(free, bool)
         axes[0] = True
         offsets = np.array(offset, float)
         relative_size = round(float(_reach(parents, offsets).max()) / REFERENCE_MM, 6)
-        if not 0.0 < relative_size < math.inf:
-            raise LiexError(
-                f"{origin}: a skeleton needs a second joint at some distance from the first one"
-            )
+        refuse(
+            LiexError,
+            (
+                not 0.0 < relative_size < math.inf,
+                f"{origin}: a skeleton needs a second joint at some distance from the first one",
+            ),
+        )
         return Skeleton(
             name=table["name"],
             names=names,
@@ -313,11 +349,14 @@ def _with_mesh(table: dict[str, Any], path: Path) -> dict[str, Any]:
 
     name = surface["mesh"]
     unit_mm = surface.get("mesh_unit_mm", 1.0)
-    if not isinstance(name, str) or not (_is_number(unit_mm) and unit_mm > 0):
-        raise LiexError(
+    refuse(
+        LiexError,
+        (
+            not isinstance(name, str) or not (_is_number(unit_mm) and unit_mm > 0),
             f"{path}: [surface] mesh is the name of a file and mesh_unit_mm the mm that one of its "
-            f"units is long, got {name!r} and {unit_mm!r}"
-        )
+            f"units is long, got {name!r} and {unit_mm!r}",
+        ),
+    )
     others = {key: value for key, value in surface.items() if key not in ("mesh", "mesh_unit_mm")}
     return table | {"surface": others | read_mesh(path.parent / name, float(unit_mm), str(path))}
 
@@ -344,22 +383,33 @@ def _parsed_joint(table: dict[str, Any], index: int, origin: str) -> _Joint:
         raise LiexError(f"{origin}: joint {index} has no name")
     where = f"{origin}: joint '{name}'"
     for key in table:
-        if key not in _JOINT_KEYS:
-            raise LiexError(
-                f"{where} has an unknown key '{key}'; use {', '.join(sorted(_JOINT_KEYS))}"
-            )
+        refuse(
+            LiexError,
+            (
+                key not in _JOINT_KEYS,
+                f"{where} has an unknown key '{key}'; use {', '.join(sorted(_JOINT_KEYS))}",
+            ),
+        )
     axes = table.get("axes", [])
-    if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
-        raise LiexError(f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}")
+    refuse(
+        LiexError,
+        (
+            not isinstance(axes, list) or any(axis not in AXES for axis in axes),
+            f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}",
+        ),
+    )
     limits_deg = table.get("limits_deg", {})
     usual = {axis: [-180.0, 180.0] if axis in axes else [0.0, 0.0] for axis in AXES}
     limits = (
         [limits_deg.get(axis, usual[axis]) for axis in AXES] if isinstance(limits_deg, dict) else []
     )
-    if len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits):
-        raise LiexError(
-            f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}"
-        )
+    refuse(
+        LiexError,
+        (
+            len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits),
+            f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}",
+        ),
+    )
     return (
         name,
         table.get("parent", ""),
@@ -379,8 +429,13 @@ def _is_range(pair: Any) -> bool:
 
 
 def _triple(value: Any, where: str) -> list[float]:
-    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) for x in value):
-        raise LiexError(f"{where} is a list of three numbers, got {value}")
+    refuse(
+        LiexError,
+        (
+            not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) for x in value),
+            f"{where} is a list of three numbers, got {value}",
+        ),
+    )
     return [float(x) for x in value]
 
 
@@ -407,10 +462,13 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
     Raises:
         LiexError: there is no such file, no Open3D, or no triangles in it.
     """
-    if not path.is_file():
-        raise LiexError(
-            f"{origin}: [surface] mesh should be a file next to the TOML, but there is no {path}"
-        )
+    refuse(
+        LiexError,
+        (
+            not path.is_file(),
+            f"{origin}: [surface] mesh should be a file next to the TOML, but there is no {path}",
+        ),
+    )
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -426,9 +484,12 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
         mesh.remove_unreferenced_vertices()
     vertices = np.asarray(mesh.vertices) * unit_mm
     faces = np.asarray(mesh.triangles)
-    if len(faces) < 4 or not np.isfinite(vertices).all():
-        raise LiexError(
+    refuse(
+        LiexError,
+        (
+            len(faces) < 4 or not np.isfinite(vertices).all(),
             f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} "
-            f"contains {len(faces)} of them; export it as STL, OBJ or PLY"
-        )
+            f"contains {len(faces)} of them; export it as STL, OBJ or PLY",
+        ),
+    )
     return {"vertices_mm": np.round(vertices, 3).tolist(), "faces": faces.tolist()}

@@ -23,7 +23,7 @@ from liex_lab.tracking.track import spans
 
 if TYPE_CHECKING:
     from liex_lab.simulation.corruptions import Event
-    from liex_lab.simulation.scenes.stage import TrueAnimal
+    from liex_lab.simulation.recording import TrueAnimal
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.errors import refuse
 from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, VIEW, descend
 from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.memory import Rows, check_index, check_shapes
@@ -97,14 +98,29 @@ def check_roots(roots: NDArray[Any], is_leaf: NDArray[np.bool_]) -> None:
         ValueError: the error, as a part of a sentence.
     """
     n = len(is_leaf)
-    if roots.ndim != 1 or roots.dtype.kind != "i" or not len(roots):
-        raise ValueError("its roots are not a list of integers")
+    refuse(
+        ValueError,
+        (
+            roots.ndim != 1 or roots.dtype.kind != "i" or not len(roots),
+            "its roots are not a list of integers",
+        ),
+    )
     starts = np.append(roots.astype(np.int64), n)
-    if starts[0] != 0 or not (np.diff(starts) > 0).all():
-        raise ValueError(f"its roots do not rise from 0 to its {n} nodes")
+    refuse(
+        ValueError,
+        (
+            starts[0] != 0 or not (np.diff(starts) > 0).all(),
+            f"its roots do not rise from 0 to its {n} nodes",
+        ),
+    )
     leaves = np.add.reduceat(is_leaf, roots.astype(np.int64), dtype=np.int64)
-    if not np.array_equal(2 * leaves - 1, np.diff(starts)):
-        raise ValueError("its nodes do not form complete trees")
+    refuse(
+        ValueError,
+        (
+            not np.array_equal(2 * leaves - 1, np.diff(starts)),
+            "its nodes do not form complete trees",
+        ),
+    )
 
 
 def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) -> None:
@@ -128,29 +144,47 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
     kinds = nodes.dtype == np.int32 and roots.dtype == np.int32 and leaves.dtype == np.float32
     if not (shapes and kinds):
         raise ValueError("its nodes, roots and leaves are not of the right kind")
-    if leaves.shape[1] != n_values:
-        raise ValueError(f"its leaves have {leaves.shape[1]} values, not {n_values}")
-    if not (leaves.size and np.isfinite(leaves.min()) and np.isfinite(leaves.max())):
-        raise ValueError("its leaves are not all finite")
-    if not len(roots) or roots.min() < 0 or roots.max() >= len(nodes):
-        raise ValueError(f"a root is not one of its {len(nodes)} nodes")
+    refuse(
+        ValueError,
+        (leaves.shape[1] != n_values, f"its leaves have {leaves.shape[1]} values, not {n_values}"),
+        (
+            not (leaves.size and np.isfinite(leaves.min()) and np.isfinite(leaves.max())),
+            "its leaves are not all finite",
+        ),
+        (
+            not len(roots) or roots.min() < 0 or roots.max() >= len(nodes),
+            f"a root is not one of its {len(nodes)} nodes",
+        ),
+    )
     word2 = np.ascontiguousarray(nodes[:, 2])
     at = np.flatnonzero(word2 >= 0)
     child = word2[at]
-    if (child <= at).any() or child.max(initial=-1) >= len(nodes) - 1:
-        raise ValueError("a child does not follow its parent among the nodes")
-    if -1 - int(word2.min()) >= len(leaves):
-        raise ValueError(f"a node names a leaf beyond the {len(leaves)} there are")
+    refuse(
+        ValueError,
+        (
+            (child <= at).any() or child.max(initial=-1) >= len(nodes) - 1,
+            "a child does not follow its parent among the nodes",
+        ),
+        (
+            -1 - int(word2.min()) >= len(leaves),
+            f"a node names a leaf beyond the {len(leaves)} there are",
+        ),
+    )
     tests = nodes[at, 3]
     kind = tests & 3
-    if kind.max(initial=0) > max(TWO_PROBES, ONE_PROBE, SCALAR):
-        raise ValueError("a test is of an unknown kind")
+    refuse(
+        ValueError,
+        (kind.max(initial=0) > max(TWO_PROBES, ONE_PROBE, SCALAR), "a test is of an unknown kind"),
+    )
     scalar = kind == SCALAR
     most = [tests.max(where=each, initial=-1) >> 2 for each in (~scalar, scalar)]
-    if tests.min(initial=0) < 0 or most[0] >= n_views or most[1] >= n_scalars:
-        raise ValueError(
-            f"a test reads more than the {n_views} views and {n_scalars} scalars there are"
-        )
+    refuse(
+        ValueError,
+        (
+            tests.min(initial=0) < 0 or most[0] >= n_views or most[1] >= n_scalars,
+            f"a test reads more than the {n_views} views and {n_scalars} scalars there are",
+        ),
+    )
 
 
 def check_samples(forest: Forest, samples: Samples) -> None:
@@ -165,11 +199,14 @@ def check_samples(forest: Forest, samples: Samples) -> None:
     """
     n_views, n_scalars = forest.reads
     width = samples.views.shape[1], samples.scalars.shape[1]
-    if width[0] < n_views or width[1] < n_scalars:
-        raise ValueError(
+    refuse(
+        ValueError,
+        (
+            width[0] < n_views or width[1] < n_scalars,
             f"the forest reads {n_views} views and {n_scalars} scalars, but its samples have "
-            f"{width[0]} and {width[1]}; use samples of the kind that it was trained on"
-        )
+            f"{width[0]} and {width[1]}; use samples of the kind that it was trained on",
+        ),
+    )
 
 
 @dataclass(frozen=True)

@@ -25,12 +25,9 @@ def hat(omega: ArrayLike) -> Array:
     """
     w = np.asarray(omega, float)
     matrix = np.zeros((*w.shape[:-1], 3, 3))
-    matrix[..., 0, 1] = -w[..., 2]
-    matrix[..., 0, 2] = w[..., 1]
-    matrix[..., 1, 0] = w[..., 2]
-    matrix[..., 1, 2] = -w[..., 0]
-    matrix[..., 2, 0] = -w[..., 1]
-    matrix[..., 2, 1] = w[..., 0]
+    for k, i, j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrix[..., i, j] = -w[..., k]
+        matrix[..., j, i] = w[..., k]
     return matrix
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, BodyShape
@@ -235,7 +236,6 @@ def free_path(
     Returns:
         Positions (n, 2) of the body's centre, mm, arena frame, and headings (n,) rad.
     """
-    n = len(speed)
     camera = scene.camera
     middle = floor_point(
         camera,
@@ -244,25 +244,69 @@ def free_path(
     )
     home = scene.centre if scene.freedom(scene.centre) > scene.freedom(middle) else middle
     margin = min(0.85 * spine_mm, 0.7 * scene.freedom(home))
-    position = np.empty((n, 2))
-    heading = np.empty(n)
-    at = home + rng.normal(0.0, 0.2 * margin, 2)
+    start = np.array([*(home + rng.normal(0.0, 0.2 * margin, 2)), 0.0])
     azimuth = rng.uniform(-np.pi, np.pi)
-    rate = 0.0
-    for i in range(n):
-        rate = 0.93 * rate + rng.normal(0.0, 0.25)
-        back = np.arctan2(home[1] - at[1], home[0] - at[0])
-        away = (back - azimuth + np.pi) % (2 * np.pi) - np.pi
-        close = np.clip(1.0 - (scene.freedom(at) - margin) / (0.8 * spine_mm), 0.0, 1.0)
+    rate = lfilter([1.0], [1.0, -0.93], rng.normal(0.0, 0.25, len(speed)))
+
+    def turn(i: int, close: float, away: float) -> float:
+        pace = min(speed[i] / spine_mm, 1.0)
         # it turns back faster at higher speed, within a mouse's turning rate
-        pull = 6.0 * close * np.clip(away, -1.0, 1.0) * min(speed[i] / spine_mm, 1.0)
-        azimuth += (
-            np.clip(rate * (0.2 + min(speed[i] / spine_mm, 1.0)) + pull, -7.0, 7.0) / _RATE_HZ
-        )
-        step = speed[i] / _RATE_HZ * np.array([np.cos(azimuth), np.sin(azimuth)])
-        if scene.freedom(at + step) > margin or scene.freedom(at + step) > scene.freedom(at):
-            at = at + step
-        position[i] = at
+        pull = 6.0 * close * away * pace
+        return float(np.clip(rate[i] * (0.2 + pace) + pull, -7.0, 7.0) / _RATE_HZ)
+
+    run = speed / _RATE_HZ
+    level = np.zeros(len(speed))
+    position, heading = _steered(
+        scene, home, start, azimuth, spine_mm, margin, run, level, (0.0, 0.0), turn
+    )
+    return position[:, :2], heading
+
+
+def _steered(
+    scene: SimulatedScene,
+    home: Array,
+    start: Array,
+    azimuth: float,
+    length: float,
+    margin: float,
+    run: Array,
+    pitch: Array,
+    heights: tuple[float, float],
+    turn: Callable[[int, float, float], float],
+) -> tuple[Array, Array]:
+    """A path by steps; a step that would leave the free space is rejected.
+
+    Args:
+        scene: the arena.
+        home: (2,) the free place to which the animal turns near obstacles, mm, arena frame.
+        start: (3,) first position, mm, arena frame.
+        azimuth: first heading, rad.
+        length: of the animal, mm.
+        margin: smallest distance from walls, clutter and the image border, mm.
+        run: (n,) length of each step, mm.
+        pitch: (n,) rad.
+        heights: lowest and highest position above the floor, mm.
+        turn: turn of a step, rad, by its number, the nearness of obstacles, 0 to 1, and the
+            direction of `home` to the left, rad, at most 1.
+
+    Returns:
+        Positions (n, 3) mm, arena frame, and headings (n,) rad.
+    """
+    position = np.empty((len(run), 3))
+    heading = np.empty(len(run))
+    xy, z = start[:2], float(start[2])
+    for i in range(len(run)):
+        back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
+        away = (back - azimuth + np.pi) % (2 * np.pi) - np.pi
+        here = scene.freedom(xy, z)
+        close = np.clip(1.0 - (here - margin) / (0.8 * length), 0.0, 1.0)
+        azimuth += turn(i, close, np.clip(away, -1.0, 1.0))
+        step = run[i] * np.cos(pitch[i]) * np.array([np.cos(azimuth), np.sin(azimuth)])
+        there = scene.freedom(xy + step, z)
+        if there > margin or there > here:
+            xy = xy + step
+        z = float(np.clip(z + run[i] * np.sin(pitch[i]), *heights))
+        position[i] = [*xy, z]
         heading[i] = azimuth
     return position, heading
 
@@ -407,34 +451,20 @@ def wander(
     Returns:
         Positions (n, 3) of the body's centre, mm, arena frame, and headings (n,) rad.
     """
-    n = len(speed)
     camera = scene.camera
     centre = camera.unproject([(camera.width - 1) / 2, (camera.height - 1) / 2], 1.0)
-    ray = scene.T_arena_camera.rotation @ centre
-    low, high = water
-    z = rng.uniform(low, high)
-    home = (
-        scene.T_arena_camera.translation + ray * (scene.T_arena_camera.translation[2] - z) / -ray[2]
-    )[:2]
-    margin = 0.6 * length
-    position = np.empty((n, 3))
-    headings = np.empty(n)
-    xy = home + rng.normal(0.0, 0.1 * length, 2)
+    T = scene.T_arena_camera
+    ray = T.rotation @ centre
+    z = rng.uniform(*water)
+    home = (T.translation + ray * (T.translation[2] - z) / -ray[2])[:2]
+    start = np.array([*(home + rng.normal(0.0, 0.1 * length, 2)), z])
     azimuth = rng.uniform(-np.pi, np.pi)
-    for i in range(n):
-        back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
-        away = (back - azimuth + np.pi) % (2 * np.pi) - np.pi
-        close = np.clip(1.0 - (scene.freedom(xy, z) - margin) / (0.8 * length), 0.0, 1.0)
-        azimuth += (turning[i] + 8.0 * close * np.clip(away, -1.0, 1.0)) * step_s
-        run = speed[i] * length * step_s
-        step = run * np.cos(pitch[i]) * np.array([np.cos(azimuth), np.sin(azimuth)])
-        free = scene.freedom(xy + step, z)
-        if free > margin or free > scene.freedom(xy, z):
-            xy = xy + step
-        z = float(np.clip(z + run * np.sin(pitch[i]), low, high))
-        position[i] = [*xy, z]
-        headings[i] = azimuth
-    return position, headings
+
+    def turn(i: int, close: float, away: float) -> float:
+        return float((turning[i] + 8.0 * close * away) * step_s)
+
+    run = speed * length * step_s
+    return _steered(scene, home, start, azimuth, length, 0.6 * length, run, pitch, water, turn)
 
 
 def smoothed(rows: Array, frames: float) -> Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, refuse
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
@@ -84,6 +85,21 @@ class FrameContents(Rows):
     object_faces: NDArray[np.int32] = field(default_factory=lambda: OBJECT_FACES)
 
 
+@dataclass(frozen=True)
+class TrueAnimal:
+    """The truth of one animal of a recording of n frames.
+
+    Attributes:
+        spine_mm: its length, mm.
+        joints_camera: (n, J, 3) mm, camera frame; NaN if absent.
+        visible: (n,) visible share of it, 0 if absent.
+    """
+
+    spine_mm: float
+    joints_camera: Array
+    visible: Array
+
+
 class TrueRecording(Recording):
     """A virtual recording and its truth.
 
@@ -138,6 +154,11 @@ class TrueRecording(Recording):
         """The truth as arguments of another recording of the same frames."""
         names = ("skeleton", "spine_mm", "pose", "T_arena_camera", "floor", "joints_camera")
         return {name: getattr(self, name) for name in (*names, "joints_arena")}
+
+    @cached_property
+    def animals(self) -> tuple[TrueAnimal, ...]:
+        """The truth of each animal; by default of one that is completely visible."""
+        return (TrueAnimal(self.spine_mm, self.joints_camera, np.ones(len(self))),)
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
         """Depth images of a range of frames, rendered on all threads.
@@ -449,8 +470,13 @@ def planned(
     Raises:
         LiexError: there is no split of this name.
     """
-    if name not in (*splits, SEALED):
-        raise LiexError(f"there is no split '{name}'; known are {', '.join(splits)}")
+    refuse(
+        LiexError,
+        (
+            name not in (*splits, SEALED),
+            f"there is no split '{name}'; known are {', '.join(splits)}",
+        ),
+    )
     for k in range(n_sessions):
         kind = split_of(name, k)
         seed, family, noise, erosion_px, object_share = splits[kind]

@@ -11,7 +11,7 @@ Arena frame: z up from the floor, the origin at the foot of the camera's perpend
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -242,8 +242,8 @@ class SimulatedScene:
     half: Array
     yaw: float
     wall_mm: float
-    clutter: Array
-    still: NDArray[np.float32]
+    clutter: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    still: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
     @staticmethod
     def draw(
@@ -280,11 +280,7 @@ class SimulatedScene:
         wall_mm = float(rng.uniform(low, min(high, 0.7 * height)))
         if rng.random() < setting.open_share:
             wall_mm = 0.0  # an open table
-        no_clutter = np.zeros((0, 2))
-        unseen = np.zeros((0, 0), np.float32)
-        scene = SimulatedScene(
-            camera, T_arena_camera, kind, centre, half, yaw, wall_mm, no_clutter, unseen
-        )
+        scene = SimulatedScene(camera, T_arena_camera, kind, centre, half, yaw, wall_mm)
         return scene._furnished(rng, spine_mm, setting)
 
     def _furnished(

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import RecordingError
+from liex_lab.errors import RecordingError, refuse
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
@@ -64,33 +64,24 @@ class BodySimulator:
     Attributes:
         species: the animal's species.
         splits: names of the test splits.
+        protocol: a sentence on the test splits, for reports of results.
+        test_postures: '': postures follow from the seeds alone.
+        sources: source of the training images.
     """
 
     species: Species
     splits: tuple[str, ...] = tuple(SPLITS)
+    protocol: str = (
+        "each with its own camera, arena, animal; the background, the floor, the blob and the "
+        "animal's size are found by the product, nothing is handed over. "
+    )
+    test_postures: str = ""
+    sources: str = "rendered from a seed; no recording of an animal was used"
 
     @property
     def skeleton(self) -> Skeleton:
         """The animal's skeleton."""
         return self.species.skeleton
-
-    @property
-    def protocol(self) -> str:
-        """One sentence on the test splits, for reports of results."""
-        return (
-            "each with its own camera, arena, animal; the background, the floor, the blob and the "
-            "animal's size are found by the product, nothing is handed over. "
-        )
-
-    @property
-    def test_postures(self) -> str:
-        """'': postures follow from the seeds alone."""
-        return ""
-
-    @property
-    def sources(self) -> str:
-        """Source of the training images, one phrase."""
-        return "rendered from a seed; no recording of an animal was used"
 
     def training_blocks(
         self, seed: int, n_blocks: int, **settings: Any
@@ -254,8 +245,10 @@ def tracking_sequence(
     Raises:
         RecordingError: there is no such sequence, or none of this animal.
     """
-    if name not in SEQUENCES:
-        raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
+    refuse(
+        RecordingError,
+        (name not in SEQUENCES, f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}"),
+    )
     if isinstance(world, HandSimulator):
         sensor, step_ns, floats = sensor or NYU_SENSOR, FRAME_NS, True
     else:
@@ -380,11 +373,14 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
         RecordingError: the kind, a setting or its value is invalid, or the animal is missing.
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
-    if kind not in _KINDS:
-        raise RecordingError(
+    refuse(
+        RecordingError,
+        (
+            kind not in _KINDS,
             f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in "
-            f"{_EXAMPLE}"
-        )
+            f"{_EXAMPLE}",
+        ),
+    )
     stated = dict(parse_qsl(query, keep_blank_values=True))
     session: Recording
     if kind == _SCENE:
@@ -392,11 +388,14 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     else:
         usual = "mouse" if kind in _SEQUENCES else ""
         animal = _ANIMALS.get(kind) or stated.pop("animal", usual)
-        if not animal:
-            raise RecordingError(
+        refuse(
+            RecordingError,
+            (
+                not animal,
                 f"{address} lacks the animal that moves, as in "
-                "synthetic:move?animal=snake.toml&seed=3"
-            )
+                "synthetic:move?animal=snake.toml&seed=3",
+            ),
+        )
         skeleton = Skeleton.load(animal)
         world = world_of(skeleton)
         values = _values(address, stated, _settings(kind, skeleton.length))
@@ -431,11 +430,14 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
     settings["build"] = (str, lambda build: build in _BUILDS, f"one of {', '.join(_BUILDS)}")
     values = _values(address, stated, settings)
     seed = values.pop("seed", 0)
-    if seed >= SEALED_FROM:
-        raise RecordingError(
+    refuse(
+        RecordingError,
+        (
+            seed >= SEALED_FROM,
             f"{address}: seeds from {SEALED_FROM} on are kept for `liex evaluate scenes --sealed`; "
-            "take a smaller one"
-        )
+            "take a smaller one",
+        ),
+    )
     family = values.pop("build", _BUILDS[0])
     return film(named, seed, values.pop("frames", 300), family=family, **values)
 
@@ -454,10 +456,13 @@ def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting])
             values[key] = read(text)
         except (KeyError, ValueError):
             values[key] = None
-        if values[key] is None or not holds(values[key]):
-            raise RecordingError(
-                f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}"
-            )
+        refuse(
+            RecordingError,
+            (
+                values[key] is None or not holds(values[key]),
+                f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}",
+            ),
+        )
     return values
 
 

@@ -15,7 +15,7 @@ from liex_lab.evaluation.scores import (
     tracking_figures,
 )
 from liex_lab.simulation.corruptions import Event
-from liex_lab.simulation.scenes.stage import TrueAnimal
+from liex_lab.simulation.recording import TrueAnimal
 
 # single frames
 

@@ -5,8 +5,9 @@ import pytest
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import open_recording
+from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
-from liex_lab.simulation.scenes.stage import SceneRecording, TrueScene, timing_of
+from liex_lab.simulation.scenes.stage import SceneRecording, timing_of
 from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
 
 SEED = 41
@@ -19,7 +20,7 @@ def mice(name: str, n_frames: int = N, **settings: float) -> SceneRecording:
     return made
 
 
-def heights(recording: TrueScene, frame: int) -> np.ndarray:
+def heights(recording: TrueRecording, frame: int) -> np.ndarray:
     """Height of every pixel above the true floor, mm; NaN where unread."""
     depth = recording.depths(frame, frame + 1)[0].astype(float)
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
@@ -174,7 +175,7 @@ def test_a_mirrored_hand_is_the_hand_with_left_and_right_exchanged() -> None:
 def test_a_scene_is_a_recording_by_its_address() -> None:
     address = f"synthetic:scene?name=raised&seed={SEED}&frames=3&sensor=primesense-qvga"
     recording = open_recording(address)
-    assert isinstance(recording, TrueScene)
+    assert isinstance(recording, TrueRecording)
     assert (recording.name, len(recording)) == (f"scene-raised-{SEED}", 3)
     np.testing.assert_array_equal(recording.frame(1).depth, mice("raised", 3).depths(1, 2)[0])
     with pytest.raises(RecordingError, match="there is no scene 'moon'"):

@@ -404,31 +404,38 @@ class FishActor:
         climb = np.radians(rng.normal(0.0, 5.0))
         turn = np.radians(12.0) * slow_noise(rng, len(t), 0.5)[:, 0]
         own: dict[str, Array | float] = {"turn": turn, "climb": climb, "beat": 3.0}
-        if kind == 0:
-            own["speed"] = vigour * rng.uniform(0.3, 2.2) * np.exp(-t / 0.45)
-            own["wave"] = rng.uniform(0.0, 0.4)
-        elif kind == 1:
-            own["speed"] = vigour * (0.3 + 0.15 * slow_noise(rng, len(t), 0.4)[:, 0])
-            own["wave"] = rng.uniform(0.2, 0.9)
-            own["beat"] = self.fish.tempo * rng.uniform(1.5, 3.5)
-            own["hind"] = 0.6 * slow_noise(rng, len(t), 0.4)[:, 0]
-        elif kind == 2:
+        if kind == 0:  # gliding
+            pace = vigour * rng.uniform(0.3, 2.2) * np.exp(-t / 0.45)
+            own |= {"speed": pace, "wave": rng.uniform(0.0, 0.4)}
+        elif kind == 1:  # hovering
+            own |= {
+                "speed": vigour * (0.3 + 0.15 * slow_noise(rng, len(t), 0.4)[:, 0]),
+                "wave": rng.uniform(0.2, 0.9),
+                "beat": self.fish.tempo * rng.uniform(1.5, 3.5),
+                "hind": 0.6 * slow_noise(rng, len(t), 0.4)[:, 0],
+            }
+        elif kind == 2:  # a weak turn
             side = self.fish.turn_side(rng)
             total = rng.uniform(10.0, 40.0)
             shape = bump(t, t[-1])
-            own["front"], own["hind"] = self._bent(rng, side * shape, total, 0.03)
+            front, hind = self._bent(rng, side * shape, total, 0.03)
             angle = side * np.radians(total * rng.uniform(0.6, 1.0))
-            own["turn"] = turn + angle * shape / (shape.sum() * STEP_S)
-            own["speed"] = vigour * rng.uniform(0.2, 1.2)
-            own["wave"] = rng.uniform(0.1, 0.5)
-        elif kind == 3:
-            own["climb"] = np.radians(rng.uniform(6.0, 13.0)) * rng.choice([-1.0, 1.0])
-            own["speed"] = vigour * rng.uniform(0.2, 0.8)
-            own["wave"] = rng.uniform(0.3, 0.8)
-        else:
-            own["speed"] = -vigour * rng.uniform(0.1, 0.5)
-            own["wave"] = rng.uniform(0.3, 1.0)
-            own["beat"] = 3.5
+            own |= {
+                "front": front,
+                "hind": hind,
+                "turn": turn + angle * shape / (shape.sum() * STEP_S),
+                "speed": vigour * rng.uniform(0.2, 1.2),
+                "wave": rng.uniform(0.1, 0.5),
+            }
+        elif kind == 3:  # a weak climb
+            own |= {
+                "climb": np.radians(rng.uniform(6.0, 13.0)) * rng.choice([-1.0, 1.0]),
+                "speed": vigour * rng.uniform(0.2, 0.8),
+                "wave": rng.uniform(0.3, 0.8),
+            }
+        else:  # backing
+            pace = -vigour * rng.uniform(0.1, 0.5)
+            own |= {"speed": pace, "wave": rng.uniform(0.3, 1.0), "beat": 3.5}
         return self._channels(t, roll, **own)
 
 

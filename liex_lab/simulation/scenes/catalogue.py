@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import RecordingError
+from liex_lab.errors import RecordingError, refuse
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.hand.simulator import HandSimulator
 from liex_lab.simulation.locomotion import moving_session
+from liex_lab.simulation.recording import TrueRecording
 from liex_lab.simulation.scene import (
     BOX,
     OBJECT_FACES,
@@ -25,12 +26,11 @@ from liex_lab.simulation.scene import (
 from liex_lab.simulation.scenes import places
 from liex_lab.simulation.scenes.places import Bedding, Ground, Mesh, box, render_still
 from liex_lab.simulation.scenes.stage import (
+    Mirrored,
     Moving,
-    OneAnimal,
     SceneAnimal,
     SceneContents,
     SceneRecording,
-    TrueScene,
     calm_script,
     keeping_apart,
     timing_of,
@@ -53,7 +53,7 @@ class SceneRecipe:
         n_arenas: arenas in the image, 1, 2 or 4, each with its own animal.
         around: 'bench', 'untidy' or 'table', see `places`.
         n_animals: in one arena.
-        presence: of the animals, one of `stage.PRESENCES`.
+        presence: of the animals, see `stage.timing_of`.
         worn: '', 'head stage' or 'tether'.
         fixture: '', 'house', 'object' (added during the recording), 'object out' (removed), or
             'lid'.
@@ -182,7 +182,6 @@ class Making:
     """Builds one recording; every part has its own stream of random numbers.
 
     Attributes:
-        name: of the scene.
         recipe: the scene's recipe.
         seed: seed of all random numbers.
         n_frames: length of the recording.
@@ -191,7 +190,6 @@ class Making:
         spine_mm: length of the animals, mm; None draws it.
     """
 
-    name: str
     recipe: SceneRecipe
     seed: int
     n_frames: int
@@ -203,8 +201,8 @@ class Making:
         parts = ("camera", "place", "floor", "bedding", "worn", "sensor", "noise", "object")
         return np.random.default_rng([self.seed, 77, parts.index(part)])
 
-    def recording(self) -> SceneRecording:
-        """The recording with the truth of all animals in it."""
+    def recording(self, name: str) -> SceneRecording:
+        """The recording of this name with the truth of all animals in it."""
         recipe = self.recipe
         species = MouseSpecies()
         arenas = self._arenas()
@@ -234,7 +232,7 @@ class Making:
             recipe.drift_mm
             * (1.0 - np.exp(-np.arange(self.n_frames) / max(1.0, 0.35 * self.n_frames))),
         )
-        return SceneRecording(f"scene-{self.name}-{self.seed}", self.name, stage)
+        return SceneRecording(name, stage)
 
     @property
     def _epoch_frames(self) -> int:
@@ -258,8 +256,6 @@ class Making:
             np.asarray(recipe.half_mm, float),
             float(rng.uniform(-0.08, 0.08)),
             recipe.wall_mm,
-            np.zeros((0, 2)),
-            np.zeros((0, 0), np.float32),
         )
         if recipe.fixture in ("house", *_OBJECTS):
             whole = replace(whole, clutter=self._clutter(whole))
@@ -448,7 +444,7 @@ def film(
     sensor: Sensor = KINECT_V2_SENSOR,
     family: str = "other",
     spine_mm: float | None = None,
-) -> TrueScene:
+) -> TrueRecording:
     """A recording of a scene.
 
     Args:
@@ -466,14 +462,16 @@ def film(
     Raises:
         RecordingError: there is no such scene.
     """
-    if name not in SCENES:
-        raise RecordingError(f"there is no scene '{name}'; known are {', '.join(SCENES)}")
+    refuse(
+        RecordingError,
+        (name not in SCENES, f"there is no scene '{name}'; known are {', '.join(SCENES)}"),
+    )
     title = f"scene-{name}-{seed}"
     if name in RECIPES:
-        return Making(name, RECIPES[name], seed, n_frames, sensor, family, spine_mm).recording()
+        making = Making(RECIPES[name], seed, n_frames, sensor, family, spine_mm)
+        return making.recording(title)
+    body: dict[str, Any] = {"family": family, "spine_mm": spine_mm, "name": title}
     if name == "fish":
-        fish = moving_session(FishSpecies(), [seed, 5], n_frames, family=family, spine_mm=spine_mm)
-        return OneAnimal(title, name, fish)
-    simulator = HandSimulator(Skeleton.load("hand"))
-    hand = simulator.motion([seed, 6], n_frames, family=family, spine_mm=spine_mm)
-    return OneAnimal(title, name, hand, mirrored=name == "mirrored-hand")
+        return moving_session(FishSpecies(), [seed, 5], n_frames, **body)
+    hand = HandSimulator(Skeleton.load("hand")).motion([seed, 6], n_frames, **body)
+    return hand if name == "hand" else Mirrored(title, hand)

@@ -528,14 +528,13 @@ def lid_bars(arena: SimulatedScene, share: float = 0.35) -> list[Mesh]:
     long, wide = arena.half
     z = arena.wall_mm + 2.0
     reach = share * long
-    bars = []
-    for y in np.arange(-wide, wide + 0.1, 9.0):
-        middle = arena.centre + turned(np.array([long - reach, y]), arena.yaw)
-        bars.append(box([*middle, z], [reach, 1.3, 1.3], arena.yaw))
-    for x in (long - 2.0 * reach, long - reach):
-        middle = arena.centre + turned(np.array([x, 0.0]), arena.yaw)
-        bars.append(box([*middle, z - 2.5], [1.8, wide, 1.8], arena.yaw))
-    return bars
+    # position along and across the cage, height, and half sides
+    along = [(long - reach, y, z, [reach, 1.3, 1.3]) for y in np.arange(-wide, wide + 0.1, 9.0)]
+    across = [(x, 0.0, z - 2.5, [1.8, wide, 1.8]) for x in (long - 2.0 * reach, long - reach)]
+    return [
+        box([*(arena.centre + turned(np.array([x, y]), arena.yaw)), high], half, arena.yaw)
+        for x, y, high, half in (*along, *across)
+    ]
 
 
 def house(arena: SimulatedScene, place: Array, yaw: float) -> list[Mesh]:
@@ -549,13 +548,12 @@ def house(arena: SimulatedScene, place: Array, yaw: float) -> list[Mesh]:
     Returns:
         The meshes of its roof and three walls.
     """
-    parts = []
-    for x, y, z, half in (
+    sides = (
         (0.0, 0.0, 66.0, (60.0, 48.0, 1.5)),
         (-59.0, 0.0, 33.0, (1.5, 48.0, 33.0)),
         (0.0, 47.0, 33.0, (60.0, 1.5, 33.0)),
         (0.0, -47.0, 33.0, (60.0, 1.5, 33.0)),
-    ):
-        middle = place + turned(np.array([x, y]), yaw)
-        parts.append(box([*middle, z], half, yaw))
-    return parts
+    )
+    return [
+        box([*(place + turned(np.array([x, y]), yaw)), z], half, yaw) for x, y, z, half in sides
+    ]

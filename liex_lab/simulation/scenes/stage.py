@@ -20,14 +20,13 @@ from liex_lab.optics.camera import Camera
 from liex_lab.simulation._render_kernels import part_of
 from liex_lab.simulation._sensor_kernels import ANIMAL, OBJECT
 from liex_lab.simulation.locomotion import Path, Script, free_path, smoothed, walk
-from liex_lab.simulation.recording import TrueRecording, render_frames
+from liex_lab.simulation.recording import TrueAnimal, TrueRecording, render_frames
 from liex_lab.simulation.scene import SimulatedScene
 from liex_lab.simulation.scenes.places import Mesh, joined
 from liex_lab.simulation.species import MouseSpecies, Species
 
 Array = NDArray[np.float64]
 
-PRESENCES = ("always", "asleep", "still", "late", "leaves", "never")
 AWAY = np.array([0.0, 0.0, 1e7])  # mm: behind any downward-facing camera
 _RATE_HZ = 30.0
 _TRIES = 60
@@ -275,21 +274,6 @@ def keeping_apart(other: Array, spine_mm: float) -> Path:
 
 
 @dataclass(frozen=True)
-class TrueAnimal:
-    """The truth of one animal of a recording of n frames.
-
-    Attributes:
-        spine_mm: its length, mm.
-        joints_camera: (n, J, 3) mm, camera frame; NaN if absent.
-        visible: (n,) visible share of it, 0 if absent.
-    """
-
-    spine_mm: float
-    joints_camera: Array
-    visible: Array
-
-
-@dataclass(frozen=True)
 class Moving:
     """A moving object other than an animal: worn, added, or held in a hand.
 
@@ -350,76 +334,40 @@ class SceneContents:
     offset_mm: Array
 
 
-class TrueScene(TrueRecording):
-    """A scene by name with the truth of all animals in it.
+class Mirrored(TrueRecording):
+    """A recording with left and right exchanged."""
 
-    Attributes:
-        scene: name of the scene.
-    """
-
-    scene: str
-
-    @cached_property
-    def animals(self) -> tuple[TrueAnimal, ...]:
-        """The truth of each animal; () if there are none."""
-        raise NotImplementedError
-
-
-class OneAnimal(TrueScene):
-    """A recording of one fully visible animal as a scene, optionally mirrored."""
-
-    def __init__(
-        self, name: str, scene: str, filmed: TrueRecording, *, mirrored: bool = False
-    ) -> None:
-        """Wrap a recording as a scene.
+    def __init__(self, name: str, filmed: TrueRecording) -> None:
+        """Mirror a recording.
 
         Args:
-            name: of the recording.
-            scene: name of the scene.
-            filmed: the recording of one animal.
-            mirrored: exchange left and right in every depth image, and in the truth.
+            name: of the mirrored recording.
+            filmed: the recording, of a camera without lens distortion.
         """
         c = filmed.camera
-        camera = replace(c, cx=c.width - 1.0 - c.cx) if mirrored else c
-        across = np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
-        truth = {"joints_camera": filmed.joints_camera * across, "joints_arena": None}
-        super().__init__(name, camera, filmed.times_ns.copy(), **filmed.truth | truth)
-        self.scene = scene
+        camera = replace(c, cx=c.width - 1.0 - c.cx)
+        joints = filmed.joints_camera * np.array([-1.0, 1.0, 1.0])
+        truth = filmed.truth | {"joints_camera": joints, "joints_arena": None}
+        super().__init__(name, camera, filmed.times_ns.copy(), **truth)
         self._filmed = filmed
-        self._mirrored = mirrored
-
-    @cached_property
-    def animals(self) -> tuple[TrueAnimal, ...]:
-        """The truth of the one animal."""
-        return (TrueAnimal(self.spine_mm, self.joints_camera, np.ones(len(self))),)
 
     def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth images of a range of frames, rendered on all threads.
-
-        Args:
-            start: first frame.
-            stop: one past the last frame.
-
-        Returns:
-            (stop - start, H, W) float32 mm, 0 if unread.
-        """
-        depths = self._filmed.depths(start, stop)
-        return np.ascontiguousarray(depths[..., ::-1]) if self._mirrored else depths
+        """Depth images of a range of frames, rendered on all threads."""
+        return np.ascontiguousarray(self._filmed.depths(start, stop)[..., ::-1])
 
 
-class SceneRecording(TrueScene):
+class SceneRecording(TrueRecording):
     """A scene of mice from a recipe.
 
     Attributes:
         stage: its contents.
     """
 
-    def __init__(self, name: str, scene: str, stage: SceneContents) -> None:
+    def __init__(self, name: str, stage: SceneContents) -> None:
         """Record a stage.
 
         Args:
             name: of the recording.
-            scene: name of the scene.
             stage: its contents.
         """
         n = len(stage.seeds)
@@ -436,7 +384,6 @@ class SceneRecording(TrueScene):
             pose=pose,
             T_arena_camera=stage.T_arena_camera,
         )
-        self.scene = scene
         self.stage = stage
 
     @cached_property
