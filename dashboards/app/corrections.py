@@ -38,11 +38,9 @@ Correct = Callable[[Path, Sequence[Correction], Sequence[int], str], object]
 Report = Callable[[Path], object]
 
 WAITING = "waiting"
-SAVING = "saving"
 SAVED = "saved"
 FAILED = "failed"
 _CALM_S = 3.0  # time without a correction before the report is made again
-_KEPT_TICKETS = 1000
 
 
 @dataclass
@@ -136,7 +134,7 @@ class Saver:
         with self._changed:
             ticket.id = max(self._known, default=0) + 1
             self._known[ticket.id] = ticket
-            if len(self._known) > _KEPT_TICKETS:
+            if len(self._known) > 1000:  # the latest thousand tickets are kept
                 self._known.pop(min(self._known))
             self._waiting.append(ticket)
             if ticket.id == 1:
@@ -174,7 +172,7 @@ class Saver:
                     break
                 if ticket.what is None and any(one.what for one in batch):
                     break  # a step of the log begins with its undos
-                ticket.state = SAVING
+                ticket.state = "saving"
                 batch.append(ticket)
             return batch, None
 

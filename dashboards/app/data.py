@@ -33,8 +33,6 @@ NO_POSE = "no pose or no frame"
 OTHER = "other actions"
 GREY = "#a3a39b"
 NO_POSE_COLOUR = "#3a3f45"
-_READERS = 4  # threads; most of the time is spent opening files
-_HELD = 6  # sessions whose tables stay in memory
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,8 @@ class StudyData:
         self._facts: dict[str, tuple[Any, dict[str, Any]]] = {}
         self._stats: dict[Any, pd.DataFrame] = {}
         self._whole: tuple[Any, pd.DataFrame] | None = None
-        self._open = Recent(_HELD)
+        # sessions whose tables stay in memory
+        self._open = Recent(6)
         self.entries: dict[str, Entry] = {}
         self.refresh()
 
@@ -220,7 +219,8 @@ class StudyData:
     def _measured(self) -> list[tuple[Entry, dict[str, Any]]]:
         """Every measured session with its facts."""
         done = self.done
-        with ThreadPoolExecutor(_READERS) as pool:
+        # threads; most of the time is spent opening files
+        with ThreadPoolExecutor(4) as pool:
             return list(zip(done, pool.map(self._facts_of, done), strict=True))
 
     def _facts_of(self, entry: Entry) -> dict[str, Any]:

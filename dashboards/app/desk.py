@@ -31,8 +31,6 @@ Suggest = Callable[[Path], pd.DataFrame]
 Stretch = dict[str, Any]  # start_s, stop_s, kind and why
 
 MOST_ROWS = 2000  # per request
-_NEAR_S = 0.5  # frames or events closer in time form one stretch
-_HELD = 6  # desks that stay in memory
 
 
 class Desk(Footage):
@@ -207,7 +205,8 @@ class Desks:
         self._find = find
         self._images = images
         self._suggest = suggest
-        self._kept = Recent(_HELD)
+        # desks that stay in memory
+        self._kept = Recent(6)
 
     def of(self, key: str) -> Desk:
         """The desk of the session `key`.
@@ -233,10 +232,11 @@ def _stretch(start_s: float, stop_s: float, kind: str, why: str, **more: str) ->
 
 
 def _runs(start_s: Array, stop_s: Array) -> list[NDArray[np.intp]]:
-    """The rows of spans in order of time, split where they are more than `_NEAR_S` apart."""
+    """The rows of spans in order of time, split where they are more than 0.5 s apart."""
     if not len(start_s):
         return []
-    far = np.flatnonzero(start_s[1:] - stop_s[:-1] > _NEAR_S) + 1
+    # frames or events closer in time form one stretch
+    far = np.flatnonzero(start_s[1:] - stop_s[:-1] > 0.5) + 1
     return np.split(np.arange(len(start_s)), far)
 
 
@@ -256,8 +256,6 @@ def _plain(values: Any) -> Any:
 
 ENDS = "ends"
 IDENTITY = "identity"
-_SPINE_MM = 90.0  # of an animal of unknown length
-_LEAST_JUMP = 0.5  # of the spine; excludes the jitter of a fast camera
 _HUMAN = "human"
 
 
@@ -274,7 +272,8 @@ def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretc
     Raises:
         SessionError: a table is damaged.
     """
-    spine_mm = float(session.metadata["animal"].get("spine_mm") or _SPINE_MM)
+    # 90 mm for an animal of unknown length
+    spine_mm = float(session.metadata["animal"].get("spine_mm") or 90.0)
     found: list[Stretch] = []
     for animal in animals:
         found += [*_exchanged_ends(animal), *_jumps(session, animal, spine_mm)]
@@ -326,7 +325,8 @@ def _jumps(session: Session, animal: SessionAnimal, spine_mm: float) -> Iterator
     rows = np.flatnonzero(np.isfinite(animal.xy_mm).all(axis=1))
     time_s = animal.frames["time_s"].to_numpy(float)[rows]
     moved_mm = np.linalg.norm(np.diff(animal.xy_mm[rows], axis=0), axis=1)
-    far = (moved_mm > fastest_mm_s * np.diff(time_s)) & (moved_mm > _LEAST_JUMP * spine_mm)
+    # half a spine excludes the jitter of a fast camera
+    far = (moved_mm > fastest_mm_s * np.diff(time_s)) & (moved_mm > 0.5 * spine_mm)
     for k in np.flatnonzero(far):
         jump = f"the body jumps {moved_mm[k]:.0f} mm from one frame to the next"
         why = f"{jump}: perhaps another object is followed"

@@ -20,9 +20,6 @@ from ..figures.animals import DepthImages
 from ..report.contact_sheet import png, png_uri, scene_marks, shade, svg_marks
 from .data import StudyData
 
-_N_FRAMES = 9  # the frames from which each pixel's usual depth is computed
-_LEAST_REACH_MM = 60.0
-
 
 class Regions(Protocol):
     """Reads and writes the regions of recordings."""
@@ -132,7 +129,8 @@ class Scenes:
     def _usual(self, session: Session) -> NDArray[np.uint16]:
         """(H, W) uint16 mm: the usual depth of the session's frames."""
         n = len(session.frames)
-        rows = np.unique(np.linspace(0, n - 1, min(n, _N_FRAMES)).astype(int))
+        # at most nine frames, for each pixel's usual depth
+        rows = np.unique(np.linspace(0, n - 1, min(n, 9)).astype(int))
         depths = [self._images.depth(session, int(row)) for row in rows]
         empty = np.zeros((session.camera.height, session.camera.width), np.uint16)
         return usual_depth(np.stack([one for one in depths if one is not None] or [empty]))
@@ -162,4 +160,4 @@ def _shaded(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """Colours over the full depth range of an image, including walls and rims."""
     read = depth[depth > 0]
     reach = float(np.ptp(np.percentile(read, [3.0, 95.0]))) if len(read) else 0.0
-    return shade(depth, max(reach, _LEAST_REACH_MM))
+    return shade(depth, max(reach, 60.0))  # the least range, mm

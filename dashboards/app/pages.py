@@ -61,8 +61,6 @@ from .tables import number, records, session_address
 ShowReplay = Callable[[Path, float], object]
 Span = tuple[float, float]
 _ASSETS = Path(__file__).parent / "assets"
-_COLUMNS = 800  # time bins of an ethogram's row
-_MOST_PARTS = 40_000  # time bins of all rows together
 _STEPS = (
     ("frame", -1, "◀ frame"),
     ("frame", 1, "frame ▶"),
@@ -306,7 +304,9 @@ def _bars(
     unit: tuple[str, float],
 ) -> list[dict[str, Any]]:
     """The runs of one ethogram row, in % of the span; nothing after the session's end."""
-    n = min(_COLUMNS, max(120, _MOST_PARTS // n_rows))
+    # time bins of an ethogram's row
+    # time bins of all rows together, at most
+    n = min(800, max(120, 40_000 // n_rows))
     start_s, stop_s = span_s
     codes = raster(one, words, start_s, stop_s, n)
     end = int(np.ceil(n * np.clip((one.duration_s - start_s) / (stop_s - start_s), 0.0, 1.0)))

@@ -38,8 +38,6 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MOST_BYTES = 4 << 20  # of a request's body; a correction has a few hundred bytes
 _SAVER = "liex_saver"
 _IDLE_S = 30  # browsers open connections before they need them; an idle one is closed
-_CONNECTIONS = 256  # open at the same time; a browser opens six
-_THREADS = 12
 # addresses to listen on that a browser cannot open
 _EVERYWHERE = ("", "0.0.0.0", "::")  # nosec B104: only compared with
 _COOKIE = "liex_dashboard"
@@ -186,11 +184,12 @@ def serve(app: Flask, host: str, port: int, report: Callable[[int], object]) -> 
             f"the dashboard cannot listen on {host}, port {port} ({error.strerror or error}); name "
             "another with --port, or 0 for any that is free"
         ) from None
+    # open at the same time; a browser opens six
     server = create_server(
         app,
         sockets=[listening],
-        threads=_THREADS,
-        connection_limit=_CONNECTIONS,
+        threads=12,
+        connection_limit=256,
         channel_timeout=_IDLE_S,
         cleanup_interval=_IDLE_S,
         max_request_body_size=MOST_BYTES,

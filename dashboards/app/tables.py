@@ -104,8 +104,6 @@ FLIPS = {
     "source": "by",
 }
 BOUT_UNITS = {"peak_speed_mm_s": "mm/s"}
-_ESTIMATES = ("estimate", "ci_low", "ci_high")  # in the unit of the measure
-_LONG = ("test", "refused")
 STATES = {
     "done": "done",
     "changed": "changed since",
@@ -292,7 +290,10 @@ def _cell(
     about = str(row.get("measure", ""))
     if column == "measure":
         return {"kind": "", "text": read_as(about, table.units.get(about, ""))}
-    if unit := table.units.get(about if column in _ESTIMATES else column, ""):
+    # estimates have the unit of the measure
+    if unit := table.units.get(
+        about if column in ("estimate", "ci_low", "ci_high") else column, ""
+    ):
         value = as_read(value, unit)[0]
     if column == "state":
         state = state_in_words(str(value), str(row.get("reason", "")))
@@ -301,7 +302,7 @@ def _cell(
         texts = (str(row[name]) for name in ("reason", "remedy", "damage"))
         value = "; ".join(one for one in texts if one not in ("", "nan", "new"))
         return {"kind": "said", "text": value}
-    if column in _LONG:
+    if column in ("test", "refused"):
         return {"kind": "said", "text": str(value)}
     text = number(value, places)
     if column.endswith("_share") and isinstance(value, int | float) and np.isfinite(value):

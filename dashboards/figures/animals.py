@@ -35,8 +35,6 @@ KINEMATICS = (
     "bend_rad",
     "opening",
 )
-_STATED = ("subject_id", "group")
-_OPEN_FILES = 3
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,10 @@ def session_animals(session: Session) -> list[SessionAnimal]:
     narrow = session.narrowed(frames=(*FRAMES, *more), kinematics=(*KINEMATICS, *more))
     found = {}
     for k, name in enumerate(names):
-        stated = [table[key].iloc[k] if k < len(table) and key in table else "" for key in _STATED]
+        stated = [
+            table[key].iloc[k] if k < len(table) and key in table else ""
+            for key in ("subject_id", "group")
+        ]
         subject, group = (value if isinstance(value, str) else "" for value in stated)
         found[name] = SessionAnimal(narrow, name, alone, subject, group)
     return list(found.values())
@@ -220,7 +221,7 @@ class DepthImages:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._open = Recent(_OPEN_FILES, lambda opened: opened[0].close())
+        self._open = Recent(3, lambda opened: opened[0].close())
 
     def depth(self, session: Session, row: int) -> NDArray[np.uint16] | None:
         """(H, W) uint16 mm, 0 where unread; None if the session has no depth of this frame.

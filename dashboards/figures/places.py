@@ -33,8 +33,6 @@ from .style import (
     time_unit,
 )
 
-_MOST_PLACES = 20_000  # of a trajectory: five per second of an hour
-_PIECES = 64  # colours of a trajectory
 _ACROSS = 3  # panels per row
 
 
@@ -203,8 +201,10 @@ def trajectory(animal: SessionAnimal) -> Figure | None:
     colours = ScalarMappable(clock, colormaps["viridis"].with_extremes())
     path = np.column_stack([animal.column("x_mm"), animal.column("y_mm")])
     time_s = animal.frames["time_s"].to_numpy(float)
-    rows = np.unique(np.linspace(0, len(path) - 1, min(len(path), _MOST_PLACES)).astype(int))
-    for piece in np.array_split(rows, min(_PIECES, max(1, len(rows) // 2))):
+    # at most five points per second of an hour
+    rows = np.unique(np.linspace(0, len(path) - 1, min(len(path), 20_000)).astype(int))
+    # at most 64 colours
+    for piece in np.array_split(rows, min(64, max(1, len(rows) // 2))):
         part = np.append(piece, rows[rows > piece[-1]][:1])
         colour = colours.to_rgba(time_s[piece[0]] / size)
         axes.plot(*path[part].T, color=colour, linewidth=1.0, solid_capstyle="round")

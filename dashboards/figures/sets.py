@@ -31,7 +31,6 @@ PAGES = "pages"  # the format with all figures in one file, one per page
 KINDS = (*FORMATS, PAGES)
 _PAGES_FILE = "figures.pdf"
 COMPARISON_FILE = "comparison.json"
-_N_FRAMES = 9  # frames from which the empty arena is computed
 OF_SESSION: dict[str, tuple[str, Callable[[SessionAnimal], Figure | None]]] = {
     "ethogram": ("what the animal did when", times.ethogram),
     "curves": ("speed, heights and predicted error over time", times.curves),
@@ -313,7 +312,8 @@ def _files(folder: Path) -> list[Path]:
 def _arena(session: Session) -> Figure | None:
     """The arena from some frames of the session's replay; None without depth."""
     n = len(session.frames) if keeps_depth(session) else 0
-    rows = np.unique(np.linspace(0, max(n - 1, 0), _N_FRAMES).astype(int)) if n else ()
+    # nine frames, for the empty arena
+    rows = np.unique(np.linspace(0, max(n - 1, 0), 9).astype(int)) if n else ()
     with closing(DepthImages()) as images:
         found = [images.depth(session, int(row)) for row in rows]
     return places.arena_map(session, [image for image in found if image is not None])

@@ -38,7 +38,6 @@ BLUE = "#4477aa"
 GROUP_COLOURS = ("#7f7f7f", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GROUP_MARKS = ("o", "s", "D", "^", "P", "X", "*")
 _PAGE = {INK: "--ink", MUTED: "--muted", LINE: "--line", SOFT: "--soft", PAPER: "--paper"}
-_FACE = "'DejaVu Sans'"  # comes with matplotlib: the same figure on every machine
 _FACES = "Arial, Helvetica, 'DejaVu Sans', sans-serif"  # narrower fonts fit as well
 _KEYS = 6  # actions per row of the key
 _BARS_MM = (10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
@@ -262,7 +261,8 @@ def image_bytes(figure: Figure, kind: str) -> bytes:
     paper = "white" if kind == "png" else "none"
     figure.savefig(held, format=kind, metadata=undated, facecolor=paper)
     made = held.getvalue()
-    return made.replace(_FACE.encode(), _FACES.encode()) if kind == "svg" else made
+    # this font comes with matplotlib: the same figure on every machine
+    return made.replace(b"'DejaVu Sans'", _FACES.encode()) if kind == "svg" else made
 
 
 def on_page(svg: bytes, name: str, title: str) -> str:

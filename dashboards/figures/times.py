@@ -37,11 +37,8 @@ from .style import (
 )
 
 _MOST_COLUMNS = 1200  # of a curve; more points cannot be distinguished on a page
-_LANE_MM = 4.0
 _CURVE_MM = 17.0
-_MOST_DOTS = 600  # frames of a stretch with a marker for each value
 _BESIDE_S = 0.2  # margin of a stretch, so that its curves reach its ends
-_HAIR_MM = 0.05  # bouts with a smaller distance are one bar
 
 
 Span = tuple[float, float]
@@ -65,7 +62,7 @@ def ethogram(animal: SessionAnimal, span_s: Span | None = None) -> Figure | None
     words = animal.words
     if not words and not len(animal.lost_s):
         return None
-    height = _LANE_MM * max(len(words), 1)
+    height = 4.0 * max(len(words), 1)  # a lane's height, mm
     figure = sheet(TWO_COLUMNS_MM, height + 15.0)
     width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
     axes = panel(figure, LEFT_MM, 8.0, width, height)
@@ -74,7 +71,8 @@ def ethogram(animal: SessionAnimal, span_s: Span | None = None) -> Figure | None
         f"Ethogram, {animal.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame"
     )
     _, size = time_unit(last_s - first_s)
-    hair_s = _HAIR_MM * (last_s - first_s) / width
+    # bouts closer than 0.05 mm on paper are one bar
+    hair_s = 0.05 * (last_s - first_s) / width
 
     def draw(spans: Array, row: tuple[float, float], gid: str, colour: str = "") -> None:
         near = spans[(spans[:, 1] >= first_s) & (spans[:, 0] <= last_s)]
@@ -129,7 +127,8 @@ def curves(
             f"{title}, {animal.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
         kept = kept_rows(values[near], _MOST_COLUMNS)
-        marker = "" if span_s is None or len(kept) > _MOST_DOTS else "o"
+        # a marker for each value of a short stretch
+        marker = "" if span_s is None or len(kept) > 600 else "o"
         axes.plot(
             time_s[near][kept] / size, values[near][kept], color=colour, marker=marker, markersize=1
         )
@@ -273,8 +272,6 @@ def _clock(axes: Axes, span_s: Span, last: bool = True) -> None:
 
 CERTAIN = 0.05  # level of the corrected p
 _MORE = BLUE
-_LESS = "#d55e00"
-_AROUND = ("speed_mm_s", "nose_height_mm", "tail_beat_hz", "opening")
 _BESIDE = 4  # panels per row
 
 
@@ -396,7 +393,8 @@ def _against_chance(found: dict[str, Array], i: int, j: int) -> str:
     """The colour of a pair: significantly more or less often than chance, or neither."""
     if not found["p_fdr"][i, j] <= CERTAIN:
         return MUTED
-    return _MORE if found["probability"][i, j] > found["by_chance"][i, j] else _LESS
+    # less often
+    return _MORE if found["probability"][i, j] > found["by_chance"][i, j] else "#d55e00"
 
 
 def _matrix(axes: Axes, words: list[str], found: dict[str, Array]) -> None:
@@ -498,7 +496,11 @@ def _onsets(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
     moved = animal.kinematics
     if moved is None:
         return found
-    for curve in (one for one in drawn_curves(animal) if one.column in _AROUND):
+    for curve in (
+        one
+        for one in drawn_curves(animal)
+        if one.column in ("speed_mm_s", "nose_height_mm", "tail_beat_hz", "opening")
+    ):
         for word in animal.words:
             if curve.column == "nose_height_mm" and not word.startswith("rear"):
                 continue  # constant without rearing

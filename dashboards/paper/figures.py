@@ -57,9 +57,6 @@ _RECOGNISERS = {  # (name in the numbers, in accuracies): title
 _TRUE = "#33AADD"
 _POSE = "#CC3311"
 _GREEN = "#228833"
-_DPI = 130
-_MOST_CANDIDATES = 40
-_MOST_STAGES = 8
 _SCENE_MOMENTS = (0.08, 0.4, 0.62, 0.95)  # share of the recording's length
 _MOMENTS = 6  # of a tracked sequence
 _APART = 12  # least distance between two of them, frames
@@ -107,7 +104,7 @@ def _sheet(
 
 def _save(figure: Figure, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=_DPI)
+    figure.savefig(path, dpi=130)
     return path
 
 
@@ -287,7 +284,7 @@ def _height_map(panel: Axes, shown: Mapping[str, Any], joints_px: Array) -> None
 def draw_candidates(shown: Mapping[str, Any], path: Path) -> Path:
     """Figs. 13 to 15: candidates ranked by the learned metric, with predicted and true error."""
     ranked = shown["ranked"]
-    n = min(len(ranked["score_mm"]), _MOST_CANDIDATES)
+    n = min(len(ranked["score_mm"]), 40)  # at most 40 candidates
     columns = min(n, 10 if n > 10 else 5)
     figure, grid = _sheet(-(-n // columns), columns, 1.7, 2.25)
     true_rank = np.argsort(np.argsort(ranked["error_mm"], kind="stable")) + 1
@@ -313,7 +310,7 @@ def draw_convergence(shown: Mapping[str, Any], path: Path) -> Path:
     """Fig. 16: one candidate from start to end, and all errors after every joint and round."""
     steps = shown["steps"]
     n = len(steps["names"])
-    stages = np.unique(np.linspace(0, n - 1, min(_MOST_STAGES, n)).round().astype(int))
+    stages = np.unique(np.linspace(0, n - 1, min(8, n)).round().astype(int))  # at most eight stages
     figure = Figure(figsize=(1.7 * len(stages), 5.0), layout="constrained")
     grid = figure.add_gridspec(2, len(stages), height_ratios=[1, 1.6])
     for k, step in enumerate(stages):

@@ -53,7 +53,6 @@ _FIGURES = {  # by label, names of the files
 _ANIMAL = {"Fig. 10": "hand", "Fig. 11": "hand", "Fig. 13": "fish", "Fig. 14": "mouse"}
 _ANIMAL |= {"Fig. 15": "hand"}
 _PART = {"Fig. 18": "tracking", "Fig. 19": "actions", "Fig. 20": "actions"}
-_SHOWN_SCALE = 0.72  # of a figure's pixels: letters become as large as the page's
 
 
 def write_paper(
@@ -461,8 +460,9 @@ def _image(path: Path) -> dict[str, Any]:
     """A PNG for the template."""
     content = path.read_bytes()
     (width,) = struct.unpack(">I", content[16:20])  # of the header chunk
+    # letters become as large as the page's
     return {
         "name": path.stem.replace("_", " "),
-        "width": round(_SHOWN_SCALE * width),
+        "width": round(0.72 * width),
         "data": "data:image/png;base64," + base64.b64encode(content).decode("ascii"),
     }

@@ -17,15 +17,13 @@ from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
 from liex_lab.sessions.rrd_scene import CUTOUTS, cutout_entity, cutout_frame
 from liex_lab.sessions.viewer import ERROR
 
-BLUEPRINT_FILE = "replay.rbl"
-
 
 def write_blueprint(session: Session) -> Path:
     """Write the blueprint, replay.rbl, to a session's folder; returns its path.
 
     It applies to any replay of liex_lab when dragged into a viewer.
     """
-    path = session.path / BLUEPRINT_FILE
+    path = session.path / "replay.rbl"
     with replacing(path) as beside:
         replay_blueprint(session.metadata).save("liex_lab", str(beside))
     return path

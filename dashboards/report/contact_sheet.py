@@ -24,7 +24,6 @@ from ..figures.animals import Array, read_cutout
 from ..figures.places import hidden_places, in_image
 from ..video.film import Relief, scale_mm
 
-_MOST_HIDDEN = 24  # hiding positions to mark, the longest first
 REGION = "region"
 OUTLINE = "outline"
 FIXTURE = "fixture"
@@ -45,8 +44,6 @@ _STYLES = {
     HIDDEN: ("#ff8ad4", ""),
     BESIDE: ("#ffd24a", "2 1.5"),
 }
-_MOST_PX = 320  # per side: twice the widest display
-_UNREAD = 90  # grey
 
 
 @dataclass(frozen=True)
@@ -74,7 +71,8 @@ def scene_marks(session: Session) -> list[Mark]:
         centre = in_image(session, np.array([fixture.centre_mm]), fixture.height_mm)
         made.append(Mark(FIXTURE, centre, str(fixture)))
     hidden = hidden_places(session)
-    longest = np.argsort(hidden[:, 2] - hidden[:, 3], kind="stable")[:_MOST_HIDDEN]
+    # the 24 longest ones
+    longest = np.argsort(hidden[:, 2] - hidden[:, 3], kind="stable")[:24]
     for x, y, start, stop in hidden[np.sort(longest)]:
         made.append(
             Mark(HIDDEN, in_image(session, np.array([[x, y]])), f"{start:.1f} to {stop:.1f} s")
@@ -174,7 +172,8 @@ def image_svg(
     bone_px = np.median([np.hypot(*(points[a] - points[b])) for a, b in bones] or [w])
     usual = w / 70.0
     r = float(np.clip(0.4 * bone_px, w / 200.0, usual)) if unit is None else unit
-    share = min(_MOST_PX / max(h, w), 1.0)
+    # 320 px per side is twice the widest display
+    share = min(320 / max(h, w), 1.0)
     size = (round(share * w), round(share * h))
     small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
     parts = [f'<image href="{png_uri(small)}" width="{w}" height="{h}"/>']
@@ -205,7 +204,8 @@ def shade(depth: NDArray[np.uint16], reach_mm: float) -> NDArray[np.uint8]:
     read = depth > 0
     far = (float(np.percentile(depth[read], 95.0)) if read.any() else 0.0) + 3.0
     rgb = colormaps["viridis"](np.clip((far - depth) / reach_mm, 0.0, 1.0), bytes=True)[..., :3]
-    return np.asarray(np.where(read[..., None], rgb, _UNREAD), np.uint8)
+    # grey
+    return np.asarray(np.where(read[..., None], rgb, 90), np.uint8)
 
 
 def png(rgb: NDArray[np.uint8], fast: bool = False) -> bytes:

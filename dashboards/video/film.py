@@ -27,12 +27,7 @@ from ..figures.animals import (
 )
 from ..figures.places import in_image
 
-_UNREAD = 34  # grey of unread pixels
-_WALLS_FROM = 1.6  # of the scale: higher pixels are not the animal
-_SMOOTH_PX = 1.0
 _PLAIN = 128  # neutral light
-_WALL_MM = 8.0  # beyond the outline: its uncertainty
-_STRENGTH = 0.3
 _LIGHT = np.array([-0.5, -0.6])
 
 
@@ -88,20 +83,22 @@ class Relief:
         read = np.isfinite(heights)
         # unread pixels are floor while they are enlarged, and painted over afterwards
         clipped = np.clip(np.where(read, heights, 0.0), -10.0, 3.0 * self.top_mm)
-        even = cv2.GaussianBlur(clipped.astype(np.float32), (0, 0), _SMOOTH_PX)
+        even = cv2.GaussianBlur(clipped.astype(np.float32), (0, 0), 1.0)
         smooth = cv2.resize(even, size, interpolation=cv2.INTER_CUBIC)
         share = np.clip(255.0 / self.top_mm * smooth, 0.0, 255.0).astype(np.uint8)
         colours = cv2.LUT(cv2.merge([share] * 3), self._colours[None])
         slope_y, slope_x = np.gradient(np.asarray(even, np.float32), self.pixel_mm)
-        slope = 1.0 + _STRENGTH * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
+        slope = 1.0 + 0.3 * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
         light = (_PLAIN * np.clip(slope, 0.6, 1.4)).astype(np.uint8)
         light = cv2.resize(light, size, interpolation=cv2.INTER_LINEAR)
         colours = cv2.multiply(colours, cv2.merge([light] * 3), scale=1.0 / _PLAIN)
         outside = _part(self._outside, left, top, side) > 0.5
         # walls are dimmed; an animal that rears at a wall remains visible in front of it
-        dim = _enlarged(outside | (clipped > _WALLS_FROM * self.top_mm), size)
+        # higher pixels are not the animal
+        dim = _enlarged(outside | (clipped > 1.6 * self.top_mm), size)
         colours[dim] = colours[dim] // 4
-        colours[_enlarged(~read, size)] = _UNREAD
+        # grey
+        colours[_enlarged(~read, size)] = 34
         return np.asarray(colours, np.uint8)
 
     def scale(self, height: int) -> NDArray[np.uint8]:
@@ -140,7 +137,8 @@ def _beyond_walls(session: Session, rays: Array) -> NDArray[np.float32]:
     with np.errstate(divide="ignore", invalid="ignore"):
         on_floor = place[:2] - turned[..., :2] / turned[..., 2:] * place[2]
     distance = session.arena.wall_distance_mm(on_floor)
-    return np.asarray(distance < -_WALL_MM, np.float32)
+    # 8 mm: the outline's uncertainty
+    return np.asarray(distance < -8.0, np.float32)
 
 
 def _enlarged(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
@@ -194,11 +192,7 @@ def write(
     return int(whole.shape[1])
 
 
-_TRAIL_S = 2.0
 _LEAST_PX = 24  # half the side of the view around an animal
-_REACH = 1.9  # side of the view around an animal, in body lengths
-_MARGIN = 0.05  # around the arena
-_LOST = (255, 190, 90)
 
 
 @dataclass(frozen=True)
@@ -243,7 +237,8 @@ def smooth_path(joints: Array, camera: Camera) -> tuple[Array, int]:
         [np.convolve(padded[:, axis], kernel, "valid")[: len(rows)] for axis in (0, 1)]
     )
     length = np.linalg.norm(np.diff(joints[known], axis=1), axis=-1).sum(axis=1)
-    return smooth, max(int(_REACH * float(np.quantile(length, 0.95)) * 0.6), _LEAST_PX)
+    # the view has a side of 1.9 body lengths
+    return smooth, max(int(1.9 * float(np.quantile(length, 0.95)) * 0.6), _LEAST_PX)
 
 
 class Footage:
@@ -333,7 +328,8 @@ class Film(Footage):
         if not len(outline):
             return View(0, 0, camera.width, camera.height)
         low, high = known.min(axis=0), known.max(axis=0)
-        margin = _MARGIN * float((high - low).max())
+        # a margin around the arena
+        margin = 0.05 * float((high - low).max())
         x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int).tolist()
         most = [camera.width, camera.height]
         x1, y1 = np.minimum(np.ceil(high + margin), most).astype(int).tolist()
@@ -393,7 +389,7 @@ class Film(Footage):
     def _draw_animal(self, image: NDArray[np.uint8], at: Array, row: int, word: str) -> None:
         """Draw trail and skeleton; `at` (n, J, 2) are the joints in the image, px."""
         size = max(image.shape[1] / 320.0, 0.9)
-        first = self.row_at(self.time_s[row] - _TRAIL_S)
+        first = self.row_at(self.time_s[row] - 2.0)  # the trail of the last two seconds
         trail = at[first : row + 1].mean(axis=1)
         trail = trail[np.isfinite(trail).all(axis=1)]
         if len(trail) > 1:
@@ -427,7 +423,7 @@ class Film(Footage):
             image[top + 2 : top + size, x : x + size - 2] = _rgb(self._colours[word])
             x += write(image, word.replace("_", " "), x + size + 2, top, size) + 2 * size
         if not any(np.isfinite(joints[row]).all() for joints in self.uv):
-            write(image, "no pose", edge, height - 4 * size, size, _LOST)
+            write(image, "no pose", edge, height - 4 * size, size, (255, 190, 90))
         bar = self.relief.scale(min(6 * size, height // 3))
         right = width - edge - 6
         image[edge : edge + len(bar), right : right + 6] = bar

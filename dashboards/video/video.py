@@ -26,7 +26,6 @@ from .film import Film, scale_mm, write
 
 _CODECS = ("libx264", "libopenh264")
 _CLOCK = Fraction(1, 90_000)  # s, the common time unit of MP4
-_THREADS = 2  # fixed, because the output depends on it
 
 
 def h264() -> str:
@@ -74,7 +73,8 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8], 
         stream: Any = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = _CLOCK
-        stream.codec_context.thread_count = _THREADS
+        # fixed, because the output depends on it
+        stream.codec_context.thread_count = 2
         if codec == "libx264":
             stream.options = {"crf": "20", "preset": "veryfast"}
 
@@ -92,15 +92,11 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8], 
         container.mux(stream.encode())
 
 
-_BEFORE_S = 0.5  # before a bout
-_AFTER_S = 0.5
-_LONGEST_S = 6.0  # of a clip
 _MOST = 12  # clips of a group
 _WHOLE_PX = 640
 _CELL_PX = 240
 _HEAD_PX = 26
 _GAP_PX = 3
-_DIMMED = 0.4
 _PAPER = 18
 
 
@@ -140,7 +136,7 @@ class Cell:
         y, x = np.subtract(placed.shape[:2], shown.shape[:2]) // 2
         placed[y : y + shown.shape[0], x : x + shown.shape[1]] = shown
         over = self.start_s + after_s > self.stop_s
-        return (placed * _DIMMED).astype(np.uint8) if over else placed
+        return (placed * 0.4).astype(np.uint8) if over else placed
 
 
 def write_session(
@@ -279,8 +275,9 @@ def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
     for k, animal in enumerate(film.animals):
         for bout in animal.bouts.to_dict("records"):
             if matches(str(bout["action"]), actions):
-                start = max(float(bout["start_s"]) - _BEFORE_S, 0.0)
-                stop = min(float(bout["stop_s"]) + _AFTER_S, end, start + _LONGEST_S)
+                # from half a second before a bout to half a second after it, but at most 6 s
+                start = max(float(bout["start_s"]) - 0.5, 0.0)
+                stop = min(float(bout["stop_s"]) + 0.5, end, start + 6.0)
                 found.append(Cell(film, start, stop, animal.who, k))
     return found
 

@@ -68,8 +68,6 @@ _USERS_TO_MEND = {
     errno.ENAMETOOLONG,
     errno.ENOTDIR,
 }
-# hide Rerun's messages about a full disk, as ours replaces them
-_RUST_LOG = "warn,re_log_encoding=off,re_sdk=off"
 
 app = group_of_verbs(
     "Measure animal behaviour in depth recordings: 3D skeletons, a replay and tables.", name="liex"
@@ -356,7 +354,8 @@ def main() -> None:
     Errors that the user can correct are one sentence with exit code 1; internal errors show a
     traceback.
     """
-    os.environ.setdefault("RUST_LOG", _RUST_LOG)
+    # hide Rerun's messages about a full disk, as ours replaces them
+    os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=off,re_sdk=off")
     atexit.register(gc.freeze)  # else two collections at exit take a second
     if notice := liex_lab._KERNELS_NOTICE:
         typer.echo(f"note: {printable(notice)}", err=True)

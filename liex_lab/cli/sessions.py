@@ -437,8 +437,6 @@ def pack(
 # The commands of `liex` for studies.
 
 
-SOME_FAILED = 3  # the exit code of a study in which a session failed
-
 StudyOrInit = Annotated[
     str, typer.Argument(metavar="STUDY|init", help="A study's .toml file; init creates one.")
 ]
@@ -509,7 +507,8 @@ def cohort(
     )
     if _tell_study(standings, dry_run):
         say(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
-        raise typer.Exit(SOME_FAILED)
+        # the exit code of a study in which a session failed
+        raise typer.Exit(3)
 
 
 def dashboard(

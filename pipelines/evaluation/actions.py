@@ -56,8 +56,6 @@ Array = NDArray[np.float64]
 
 _SEEDS = 5
 _SLOWER_HZ = (15.0, 30.0)
-_LEAST_FRAMES = 7  # of a cut-out sequence
-_LEARNERS = 3  # every so many-th recording of fish trains the tree on speed alone
 _MAIN = ("macro_f1", "segment_f1_50")
 
 PROTOCOL = (
@@ -117,7 +115,8 @@ def evaluate_actions(
     recogniser = _recogniser(animal, model, pose_model, progress)
     learners = training_recordings(animal)[:N_USUAL]
     if animal == "fish":  # other animals' cut-out sequences come from these, too
-        learners = learners[::_LEARNERS]
+        # every third recording of fish trains the tree on speed alone
+        learners = learners[::3]
     learned = acted_tracks(learners, estimator, progress)
     recordings = acted(test_recordings(animal, False, minutes), estimator, progress)
     fast = acted(test_recordings(animal, True, minutes), estimator, progress)
@@ -218,7 +217,7 @@ def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
     found = []
     for one in tracks:
         for start, stop, word in zip(*ethogram.runs_of(one.words), strict=True):
-            if word and stop - start >= _LEAST_FRAMES:
+            if word and stop - start >= 7:
                 found.append(one[slice(start, stop)])
     return found
 

@@ -36,7 +36,6 @@ Array = NDArray[np.float64]
 
 POINTS = ("tail base", "hind back", "fore back", "neck", "nose")
 POSTURE = ("trunk_bend", "trunk_arch", "pitch", "head_turn", "head_pitch", "stretch")
-QUANTILES = (0.05, 0.5, 0.95)
 MOTION_PROTOCOL = (
     "Five points from the tail's base to the nose, of a real animal and of a virtual one at the "
     "same shares of its length (the inner three `above` the mid-axis, a share of the body's half "
@@ -51,8 +50,6 @@ MOTION_PROTOCOL = (
     "steps of about 1/30 s. nearest_degrees: for a real frame, the root mean square difference of "
     "the five angles to the most similar virtual posture, mirror images being one."
 )
-_OUTSIDE = (0.005, 0.995)
-_STEP_S = 1.0 / 30.0
 _UNSIGNED = ("trunk_bend", "head_turn")
 _AT_ONCE = 256
 
@@ -97,7 +94,7 @@ class PointMotion:
         """Rates of change (m,) of position, direction and angles; {} without a frame rate."""
         if self.rate_hz is None or self.clips is None:
             return {}
-        lag = max(1, round(self.rate_hz * _STEP_S))
+        lag = max(1, round(self.rate_hz / 30.0))  # about 1/30 s
         together = self.clips[lag:] == self.clips[:-lag]
         per_s = self.rate_hz / lag
         rump, neck = self.points_mm[:, 0], self.points_mm[:, 3]
@@ -128,9 +125,9 @@ def motion_figures(real: PointMotion, virtual: dict[str, PointMotion]) -> dict[s
     """Quantiles of postures and rates of change of a real animal and of virtual ones.
 
     Returns:
-        `quantiles`: by measure, then by animal, the values at `QUANTILES`; `outside`: by virtual
-            animal, then by measure, the share of real frames outside its range; `nearest_degrees`:
-            by virtual animal, the median and the 95 % quantile; `lean_degrees`: the real animal's
+        `quantiles`: by measure, then by animal, the 5 %, 50 % and 95 % quantiles; `outside`: by
+            virtual animal, then by measure, the share of real frames outside its range;
+            `nearest_degrees`: by virtual animal, the median and the 95 % quantile; `lean_degrees`: the real animal's
             median bend and turn with their signs, 0 without a lean to one side. See
             `MOTION_PROTOCOL`.
     """
@@ -138,7 +135,7 @@ def motion_figures(real: PointMotion, virtual: dict[str, PointMotion]) -> dict[s
     others = {name: _shown(one) for name, one in virtual.items()}
     quantiles = {
         measure: {
-            name: np.quantile(shown[measure], QUANTILES).tolist()
+            name: np.quantile(shown[measure], (0.05, 0.5, 0.95)).tolist()
             for name, shown in {"real": own, **others}.items()
             if measure in shown
         }
@@ -146,7 +143,7 @@ def motion_figures(real: PointMotion, virtual: dict[str, PointMotion]) -> dict[s
     }
     outside = {}
     for name, shown in others.items():
-        bounds = {m: np.quantile(shown[m], _OUTSIDE) for m in POSTURE}
+        bounds = {m: np.quantile(shown[m], (0.005, 0.995)) for m in POSTURE}
         outside[name] = {
             m: float(((own[m] < low) | (own[m] > high)).mean()) for m, (low, high) in bounds.items()
         }
@@ -196,8 +193,6 @@ UPS = {
 _SEEDS = range(300, 312)  # of recordings of a virtual mouse
 _PER_RECORDING = 300
 _N_POSTURES = 12_000
-_POSTURE_SEED = 300
-_MOST_BYTES = 2_000_000_000
 _FEWEST = 50  # frames
 
 
@@ -274,7 +269,7 @@ def read_motion(path: Path, names: Sequence[str], up: str, rate_hz: float | None
     if len(names) != len(POINTS):
         raise LiexError(f"five points are needed ({', '.join(POINTS)}), got {len(names)} names")
     try:
-        check_npz(path, _MOST_BYTES)
+        check_npz(path, 2_000_000_000)
         with np.load(path) as held:
             points = held["points_mm"].astype(float)
             known = [str(name) for name in held["names"]]
@@ -346,7 +341,7 @@ def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) ->
 
 def _postures(skeleton: Skeleton) -> Bodies:
     """Postures as in the models' training."""
-    rng, n = np.random.default_rng(_POSTURE_SEED), _N_POSTURES
+    rng, n = np.random.default_rng(300), _N_POSTURES
     species = MouseSpecies(skeleton)
     shape = species.shapes(rng, "train", n)
     camera_mm = np.full(n, np.mean(species.setting.camera_mm))

@@ -53,11 +53,9 @@ OTHER_BUILD: Final = "other-build"
 SEEDS: Final = tuple(range(500, 524))
 SEALED_SEEDS: Final = tuple(range(953_200_417, 953_200_441))
 N_FRAMES: Final = 120  # frames per recording of another build
-_N_RECORDINGS: Final = 12
 _NOISES = (0.7, 1.0, 1.5)
 _FLIP_CLASSES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 1.0)  # of p_flip
 _SIZES_MM = {"mouse": (45.0, 65.0, 80.0, 100.0), "fish": (18.0, 25.0, 32.0, 45.0)}
-_SIZES = (0.75, 1.0, 1.25, 1.5)  # of other animals, over their home length
 BUILDS_PROTOCOL = (
     "Rendered recordings of one moving animal each, of a build that no forest was trained on "
     "(the tracker's calibration knows other animals of the same family of builds, and so does what "
@@ -227,7 +225,7 @@ def sizes_of(animal: str) -> tuple[float, ...]:
     if animal in _SIZES_MM:
         return _SIZES_MM[animal]
     home = Skeleton.load(animal).length
-    return tuple(round(factor * home, 1) for factor in _SIZES)
+    return tuple(round(factor * home, 1) for factor in (0.75, 1.0, 1.25, 1.5))
 
 
 def evaluate_sizes(
@@ -308,7 +306,7 @@ def evaluate_builds(
     Raises:
         LiexError: the animal's simulator has one build only, or there are too few recordings.
     """
-    n_recordings = _N_RECORDINGS if n_frames is None else max(1, -(-n_frames // N_FRAMES))
+    n_recordings = 12 if n_frames is None else max(1, -(-n_frames // N_FRAMES))
     seeds = SEALED_SEEDS if sealed else SEEDS
     if n_recordings > len(seeds):
         raise LiexError(

@@ -57,7 +57,6 @@ _CREWS = {  # name -> number of processes, and of cores for all of them
 _N_SIMULATED = 2000  # sessions
 _COARSER = 8  # pixel stride of a long session's depth images, which go straight to disk
 _BLOCK = 256  # frames
-_COPIED = ("plan.toml", "session.rrd", "session.mcap")
 ASSUMPTIONS = (
     "simulated: every worker has the cores, the memory and the reading and writing speed that one "
     "has here; sessions take the measured times, drawn with replacement and stretched to an hour "
@@ -468,7 +467,7 @@ def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int,
     folder.mkdir()
     results.write_track(folder)
     results.write_measured(folder, behaviour.tables, behaviour.vocabulary.columns)
-    for name in _COPIED:
+    for name in ("plan.toml", "session.rrd", "session.mcap"):
         shutil.copyfile(session.path / name, folder / name)
     if (session.path / "thumbnails").is_dir():
         shutil.copytree(session.path / "thumbnails", folder / "thumbnails")

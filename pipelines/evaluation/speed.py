@@ -70,8 +70,6 @@ from ..training.pose_model import (
 
 N_FRAMES = 128
 N_REPEATS = 5
-_CANDIDATES = (5, 10, 20, 40)
-_SHRINK = (2, 1)  # every second pixel, and every pixel
 _PROTOCOL = (
     "{n} rendered {pixels} frames in memory, foreground to final pose, best of {repeats}; ratios "
     "on {cores} cores in the same run, `paper` on our engine, `paper_one_by_one` compiled but as "
@@ -91,10 +89,8 @@ LIVE_PROTOCOL = (
 _SEED = 78_001
 FPS = 30
 STEP_NS = int(1e9 / FPS)
-_KEPT = 150  # frames rendered
 # frames tracked beforehand, and their speed-up
 _WARM = 60
-_WARM_SPEED = 1000.0
 _OF_EACH = ("latency_median_ms", "latency_p95_ms", "n_frames", "n_live", "n_measured")
 _ONE_THREAD = (
     *("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
@@ -318,7 +314,8 @@ def _stages_and_costs(
         "choice": ms(default.pick, detection, size, False),
     }
     n_joints = len(default.skeleton.solved)
-    sizes = [footage.every(step) for step in _SHRINK]
+    # every second pixel, and every pixel
+    sizes = [footage.every(step) for step in (2, 1)]
     costs = {
         "joints": {
             str(n): candidates_ms(replace(default, n_joints=n))
@@ -326,7 +323,7 @@ def _stages_and_costs(
         },
         "candidates": {
             str(n): candidates_ms(replace(default, n_candidates=n, unpruned=True))
-            for n in _CANDIDATES
+            for n in (5, 10, 20, 40)
         },
         "pixels": {one.pixels: ms(one.scene.extract, one.frames, size, False) for one in sizes},
     }
@@ -389,13 +386,14 @@ def _film(
 ) -> dict[str, Any]:
     """The numbers of one camera, which starts when all cameras are ready."""
     try:
-        filmed = world_of(Skeleton.load(animal)).motion(seed, min(_KEPT, n_frames))
+        # frames rendered
+        filmed = world_of(Skeleton.load(animal)).motion(seed, min(150, n_frames))
         progress(0, None, "rendering frames")
         step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
         plan = plan_of(animal)
         warm = arriving[: learn_frames + _WARM]
-        track_live(replayed(warm, _WARM_SPEED), plan, learn_frames=learn_frames)
+        track_live(replayed(warm, 1000.0), plan, learn_frames=learn_frames)
         if ready is not None:
             ready.wait()
     except BaseException:

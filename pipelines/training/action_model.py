@@ -54,14 +54,6 @@ from .pose_model import cache_folder, estimator_of
 
 Array = NDArray[np.float64]
 
-_WALL_ERROR_MM = 4.0  # error of the estimated arena
-_FISH_STRIDE = 4
-_FISH_WINDOW = 128
-_MOUSE_WINDOW = 112
-_SIZE_FRAMES = 128  # frames in which an animal's size is measured
-_WAYS = 2  # hypotheses per frame: only the animal is in view
-_CAMERA = ("fx", "fy", "cx", "cy", "width", "height")
-
 
 @dataclass(frozen=True)
 class Scenario:
@@ -200,10 +192,11 @@ def act(
     rng = np.random.default_rng([scenario.individual, scenario.seed])
     stage = staged(scenario, rng)
     motion, rows, pose, _, _, species, camera, _, wall_mm = stage
-    window_px = _FISH_WINDOW if scenario.animal == "fish" else _MOUSE_WINDOW
+    window_px = 128 if scenario.animal == "fish" else 112
     tracker = PatchObserver(estimator)
     sizes = {} if sizes is None else sizes
-    n_sample = 1 if scenario.individual in sizes else min(_SIZE_FRAMES, len(rows))
+    # frames in which an animal's size is measured
+    n_sample = 1 if scenario.individual in sizes else min(128, len(rows))
     some = np.linspace(0, len(rows) - 1, n_sample).astype(int)
     (sample,) = rendered(rng, stage, some, window_px)
     if scenario.individual not in sizes:
@@ -275,7 +268,7 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
     motion = actor.cut(rng, scenario.word) if scenario.word else actor.uncut(rng, scenario.seconds)
     rows = motion.at(scenario.rate_hz)
     pose = fish_acts.fish_poses(rng, species, motion, rows, fish.size)
-    camera = draw_camera(rng, species, species.sensors[0], shape.fur, height_mm, _FISH_STRIDE)
+    camera = draw_camera(rng, species, species.sensors[0], shape.fur, height_mm, 4)
     girth, wall_mm = np.full(len(rows), fish.size), np.full(len(rows), np.nan)
     return motion, rows, pose, girth, None, species, camera, shape, wall_mm
 
@@ -294,7 +287,8 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     middle = pose.joints(species.skeleton)[..., :2].mean(axis=1)
     sensor = species.sensors[int(rng.integers(len(species.sensors)))]
     camera = draw_camera(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
-    wall_mm = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, _WALL_ERROR_MM)
+    # error of the estimated arena, mm
+    wall_mm = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, 4.0)
     # in some training recordings the walls are unknown
     if not scenario.novel and rng.random() >= 0.75:
         wall_mm = np.full(len(rows), np.nan)
@@ -327,7 +321,10 @@ def _save(path: Path, group: list[AgentTrack]) -> None:
     columns: dict[str, Any] = {
         "lengths": [len(one.words) for one in group],
         "animals": [one.animal for one in group],
-        "camera": [[getattr(one.camera, name) for name in _CAMERA] for one in subjects],
+        "camera": [
+            [getattr(one.camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")]
+            for one in subjects
+        ],
         "camera_turn": [one.T_arena_camera.rotation for one in subjects],
         "camera_shift": [one.T_arena_camera.translation for one in subjects],
         "sizes": [one.subject.length_mm / one.observations.skeleton.length for one in group],
@@ -337,7 +334,7 @@ def _save(path: Path, group: list[AgentTrack]) -> None:
     for name in COLUMNS:
         values = np.concatenate([getattr(one.observations, name) for one in group])
         # without the hypotheses of a second object in view
-        columns[name] = values if values.ndim == 1 else values[:, :_WAYS]
+        columns[name] = values if values.ndim == 1 else values[:, :2]
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:
         np.savez(part, **columns)
@@ -368,8 +365,6 @@ def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> li
 
 
 _SEED = 6
-# lower frame rates at which some of the generated training recordings are repeated
-_SLOWER_HZ = (15.0, 30.0)
 
 
 def learning_set(
@@ -395,9 +390,10 @@ def learning_set(
             "sessions"
         )
     recordings = acted(training_recordings(animal), estimator, progress)
+    # lower frame rates at which some of the generated training recordings are repeated
     slower = [
         one.tracked(rate)
-        for rate in _SLOWER_HZ
+        for rate in (15.0, 30.0)
         if rate < RATE_HZ[animal]
         for one in recordings[:N_USUAL:3]
     ]
@@ -570,17 +566,10 @@ RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
 FAST_HZ = 100.0
 # cut-out sequences, as in the paper, of 5 and 2 fish
 N_TRAIN = 426
-N_TEST = 173
-_TRAIN_FISH = (101, 102, 103, 104, 105)
-_TEST_FISH = (106, 107)
 _TRAIN_SET = tuple(range(201, 225))
 _TEST_SET = tuple(range(301, 307))
 N_USUAL = len(_TRAIN_SET)  # the first training recordings are of the usual camera
 _FAST_SET = {"fish": tuple(range(225, 233))}
-_SECONDS = 40.0
-_FAST_SECONDS = 20.0
-_TEST_SECONDS = 300.0  # of a test recording, about; fewer minutes use fewer recordings
-_FAST_SHARE = 1.0 / 6.0  # share of every test recording that is also filmed by a faster camera
 
 
 def cut_sequences(animal: str, test: bool) -> list[Scenario]:
@@ -588,7 +577,7 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 
     426 training sequences of five individuals, or 173 test sequences of two.
     """
-    individuals, n = (_TEST_FISH, N_TEST) if test else (_TRAIN_FISH, N_TRAIN)
+    individuals, n = ((106, 107), 173) if test else ((101, 102, 103, 104, 105), N_TRAIN)
     words = WORDS[animal]
     return [
         Scenario(
@@ -604,10 +593,8 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 
 def training_recordings(animal: str) -> list[Scenario]:
     """Uncut training recordings, 24 of 40 s each; for fish also 8 of 20 s each at 100 Hz."""
-    usual = [Scenario(animal, one, 1, RATE_HZ[animal], _SECONDS) for one in _TRAIN_SET]
-    return usual + [
-        Scenario(animal, one, 2, FAST_HZ, _FAST_SECONDS) for one in _FAST_SET.get(animal, ())
-    ]
+    usual = [Scenario(animal, one, 1, RATE_HZ[animal], 40.0) for one in _TRAIN_SET]
+    return usual + [Scenario(animal, one, 2, FAST_HZ, 20.0) for one in _FAST_SET.get(animal, ())]
 
 
 def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
@@ -619,13 +606,15 @@ def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:
             the usual one.
         minutes: total length; about 5 minutes come from each of at most 6 individuals.
     """
-    n = int(np.clip(round(60.0 * minutes / _TEST_SECONDS), 1, len(_TEST_SET)))
+    # a test recording has about 300 s; fewer minutes use fewer recordings
+    n = int(np.clip(round(60.0 * minutes / 300.0), 1, len(_TEST_SET)))
     seconds = 60.0 * minutes / n
     usual = [
         Scenario(animal, one, 3, RATE_HZ[animal], seconds, novel=True) for one in _TEST_SET[:n]
     ]
+    # the share of every test recording that is also filmed by a faster camera
     return (
-        [replace(one, rate_hz=FAST_HZ, filmed_s=_FAST_SHARE * seconds) for one in usual]
+        [replace(one, rate_hz=FAST_HZ, filmed_s=(1.0 / 6.0) * seconds) for one in usual]
         if fast
         else usual
     )

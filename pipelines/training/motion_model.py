@@ -48,16 +48,10 @@ Knots = tuple[tuple[float, float], ...]
 
 SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
 BUILD_SEEDS = tuple(range(201, 230))  # of animals of other builds
-_BUILD_FRAMES = 120
-_BINS = 3
 _Z90 = 1.645
-_FACTORS = (0.3, 3.0)
-_HELD = (0.85, 0.96)  # bounds of the coverage of each joint's 90 % intervals, by kind
-_LEAST = 0.01
 # grids of the stretch's coefficients, see `MotionParameters.stretch`
 _PER_BLUR = np.arange(0.0, 6.5, 0.5)
 _PER_SPREAD = np.arange(0.0, 3.5, 0.5)
-_CHUNK = 32
 
 
 @dataclass(frozen=True)
@@ -162,7 +156,7 @@ def other_builds(
         return []
     estimator = estimator_of(animal, "default", progress)
     plan = plan_of(animal)
-    recordings = [world.motion([seed], _BUILD_FRAMES, family="other") for seed in seeds]
+    recordings = [world.motion([seed], 120, family="other") for seed in seeds]
     return [observed(estimator, plan, "other", one, progress) for one in recordings]
 
 
@@ -190,7 +184,7 @@ def observed(
     )
     tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
     parts = []
-    for frames in recording.chunks(_CHUNK):
+    for frames in recording.chunks(32):
         progress(frames[0].index, len(recording), f"measuring {recording.name}")
         parts.append(tracker.observe(frames))
     T = scene.floor.T_arena_camera @ recording.T_arena_camera.inverse()
@@ -357,9 +351,10 @@ def calibrate_each_joint(
         there = track.posed
         deviation = np.abs(track.joints_mm[there] - each.truth[there])
         off.setdefault(each.kind, []).append(deviation / track.sd_mm[there][..., None])
+    # bounds of the coverage of each joint's 90 % intervals, by kind
     low, high = (
         np.stack([np.quantile(np.concatenate(z), held, axis=(0, 2)) for z in off.values()]) / _Z90
-        for held in _HELD
+        for held in (0.85, 0.96)
     )
     least, most = low.max(axis=0), high.min(axis=0)
     factor = np.where(least > most, np.sqrt(least * most), np.clip(1.0, least, most))
@@ -369,7 +364,7 @@ def calibrate_each_joint(
 def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     """`MotionParameters.calibration`: factors at three levels of the stated error, by bisection.
 
-    The frames are split into `_BINS` groups of equal size by their stated error. For each, f is the
+    The frames are split into 3 groups of equal size by their stated error. For each, f is the
     factor at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).
 
     Args:
@@ -385,14 +380,14 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
     )
     away = np.concatenate([claim.stretch_sd(*stretch) * claim.away for claim in claims])
     knots = []
-    for rows in np.array_split(np.argsort(stated, kind="stable"), min(_BINS, len(stated))):
+    for rows in np.array_split(np.argsort(stated, kind="stable"), min(3, len(stated))):
 
         def too_wide(factor: float, rows: NDArray[np.int64] = rows) -> bool:
             inside = deviation[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
             return bool(inside.mean() > 0.9)
 
-        least, most = _FACTORS
-        while too_wide(least) and least > _LEAST:
+        least, most = (0.3, 3.0)
+        while too_wide(least) and least > 0.01:
             least, most = 0.1 * least, least
         while most > 1.001 * least:
             factor = float(np.sqrt(least * most))

@@ -98,8 +98,6 @@ class Recipe:
 _shared: ContextVar[list[tuple[Any, TrainingSet]] | None] = ContextVar("_shared", default=None)
 # separate random streams, so that each step can be repeated by itself
 _CALIBRATION = 1
-_CORRECTION = 2
-_DRAW = 3
 # share of the images for calibrating an animal's predicted error that show bodies that vary as
 # individuals do; with the others alone, which vary far more, intervals would be wider than most
 # animals need
@@ -113,7 +111,6 @@ RECIPES = {
     "default": Recipe(),
     "paper": Recipe(n_images=40_960, n_correction=0, n_calibration=4_096, sizes=((0.0, 144),)),
 }
-_OWN_SIZES = (1.0, 0.8, 1.0, 1.25)  # sizes of a user's own animal, over its home length
 _FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # recipes by animal and variant that differ from the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
@@ -147,9 +144,10 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
         isinstance(world, simulator.BodySimulator) and isinstance(world.species, GenericSpecies)
     ):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
+    # sizes of a user's own animal, over its home length
     sizes = tuple(
         (factor * skeleton.length, world.species.window_px(factor * skeleton.length))
-        for factor in _OWN_SIZES
+        for factor in (1.0, 0.8, 1.0, 1.25)
     )
     sizes = sizes if variant == "default" else sizes[:1]
     return replace(_OWN["fish", variant], seed=Recipe.seed, sizes=sizes)
@@ -228,7 +226,7 @@ def make_model(
     Returns:
         The model with its card, in memory.
     """
-    rng = np.random.default_rng([recipe.seed, _DRAW, draw] if draw else recipe.seed)
+    rng = np.random.default_rng([recipe.seed, 3, draw] if draw else recipe.seed)
     data = rendered_set(skeleton, method, recipe, 0, recipe.n_images, progress)
     steps = len(skeleton.solved) * method.rounds + 2
     cascade, candidates = train_cascade(
@@ -259,7 +257,7 @@ def make_model(
         unseen = rendered_set(
             skeleton, method, recipe, recipe.n_images, recipe.n_correction, silent
         )
-        own = np.random.default_rng([recipe.seed, _CORRECTION])
+        own = np.random.default_rng([recipe.seed, 2])  # own random stream
         model = with_settler(with_corrector(model, unseen, own), unseen, own)
     if recipe.n_calibration:
         progress(steps - 1, steps, "calibrating the predicted error")
@@ -575,7 +573,6 @@ BASELINES: dict[str, baseline.ForestPlan | baseline.CnnPlan] = {
     "rf": baseline.ForestPlan(),
     "cnn": baseline.CnnPlan(),
 }
-_SEEN = 122_880  # total views of the CNN, whatever the number of images
 
 
 def training_of(variant: str, skeleton: Skeleton) -> Training:
@@ -592,7 +589,8 @@ def training_of(variant: str, skeleton: Skeleton) -> Training:
     recipe = replace(recipe_of("paper", skeleton), n_calibration=0)
     plan = BASELINES[variant]
     if isinstance(plan, baseline.CnnPlan):
-        plan = replace(plan, epochs=round(_SEEN / recipe.n_images))
+        # total views of the CNN, whatever the number of images
+        plan = replace(plan, epochs=round(122_880 / recipe.n_images))
     else:
         plan = replace(plan, home_turn=method_of("paper", skeleton).home_turn)
     return Training(recipe, plan)

@@ -34,11 +34,7 @@ Array = NDArray[np.float64]
 N_SESSIONS = 512
 PER_SESSION = 16
 SEEDS = {"wide": 41, "other": 42}  # of a family's images
-_SIZE_SD = 0.06  # sd of the initial error (log) of the size
-_SIZE_PASSES = 2
-_PER_PASS = 2.0  # a pass of the search covers a third of the way; this exponent extends it
 _LEAST_GOOD = 8  # frames per mini-session
-_FAR = 0.12  # of the length: a pose with a larger error is lost, and not an error of the build
 
 
 MiniSession = tuple[Array, Array]  # clues (F,), see `session_clues`; labels (K,), see `ShapePrior`
@@ -151,7 +147,8 @@ def _measured(
     for k in range(len(bodies)):
         rows = np.arange(k * PER_SESSION, (k + 1) * PER_SESSION)
         true = float(size[rows[0]])
-        begin = float(true * np.exp(_SIZE_SD * rng.standard_normal()))
+        # sd of the initial error (log) of the size
+        begin = float(true * np.exp(0.06 * rng.standard_normal()))
         found = _mini_session(
             estimator, crops[rows], crop_cameras[rows], joints[rows], bodies[k], true, begin
         )
@@ -175,17 +172,19 @@ def _mini_session(
     skeleton = estimator.skeleton
     plain = replace(estimator, model=replace(estimator.model, corrector=None))
     size = begin
-    for _ in range(_SIZE_PASSES):
+    for _ in range(2):
         estimates = plain.best_of(crops, crop_cameras, size)
         if estimates.found.sum() < _LEAST_GOOD:
             return None
         observed = float(np.median(plain.sizes_by_frame(estimates)))
-        size *= (observed / size) ** _PER_PASS
+        # a pass covers a third of the way; the exponent extends it
+        size *= (observed / size) ** 2.0
     estimates = estimator.best_of(crops, crop_cameras, size)
     pose = estimates.chosen.pose.moved(view_of(crop_cameras))
     off = truth - pose.joints(skeleton)
     length = skeleton.length * size
-    good = np.linalg.norm(off, axis=-1).mean(axis=1) < _FAR * length  # False if not finite
+    # a pose with a larger error is lost, and not an error of the build
+    good = np.linalg.norm(off, axis=-1).mean(axis=1) < 0.12 * length  # False if not finite
     if good.sum() < _LEAST_GOOD:
         return None
     use = estimates.found

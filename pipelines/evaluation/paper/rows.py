@@ -60,11 +60,7 @@ TRAINING_DRAWS = {"paper": 3, "paper-one-pose": 3, "paper-no-metric": 3}
 START_DRAWS = 5  # draws of the only initial pose, for each training
 _RATE_FRAMES = 128
 _RATE_REPEATS = 3
-_QUANTILES = 101
-_OTHER = 0.8  # of the spine
-_FAILURES = 2  # of each split
 _MARGIN = 0.35  # of the longest side of the true joints' rectangle
-_LEAST_PX = 12
 _DIGITS = 2  # of a joint's position, mm
 
 
@@ -148,7 +144,7 @@ def is_other(crops: HeightMaps, crop_cameras: Array, recording: TrueRecording) -
     height = blob.volume_mm3 / np.maximum(blob.area_mm2, 1e-9)
     centroid = np.stack([blob.x, blob.y, height], axis=-1)
     off = np.linalg.norm(centroid - joints.mean(axis=1), axis=-1)
-    return np.asarray(crops.found & (off > _OTHER * recording.spine_mm))
+    return np.asarray(crops.found & (off > 0.8 * recording.spine_mm))
 
 
 def measured(
@@ -250,7 +246,7 @@ def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[
     again = np.tile(recording, len(runs))
     posed = np.isfinite(errors.error_mm)
     found = errors.error_mm[posed]
-    quantiles = np.quantile(found, np.linspace(0, 1, _QUANTILES)) if len(found) else np.zeros(0)
+    quantiles = np.quantile(found, np.linspace(0, 1, 101)) if len(found) else np.zeros(0)
     joint_mm = errors.joint_mm[posed].mean(axis=0) if len(found) else np.zeros(0)
     return {
         "median_mm": float(np.median(found)) if len(found) else None,
@@ -337,7 +333,7 @@ def failures_in(
     worst.sort(reverse=True)
     return [
         {**pose_at(split, k, i, joints[k][i]), "error_mm": round(error, _DIGITS)}
-        for error, k, i in worst[:_FAILURES]
+        for error, k, i in worst[:2]
     ]
 
 
@@ -376,7 +372,7 @@ def _around(recording: TrueRecording, frame: int) -> dict[str, Any]:
     camera, truth = recording.camera, recording.joints_camera[frame]
     true_px = camera.project(truth)
     reach = 0.5 * np.ptp(true_px, axis=0).max()
-    half = int(np.ceil(max((1.0 + 2.0 * _MARGIN) * reach, _LEAST_PX)))
+    half = int(np.ceil(max((1.0 + 2.0 * _MARGIN) * reach, 12)))
     low = np.floor(0.5 * (true_px.min(axis=0) + true_px.max(axis=0))).astype(int) - half
     side = 2 * half + 1
     whole = recording.depths(frame, frame + 1)[0]
@@ -414,12 +410,6 @@ INITIAL_POSES = "initial poses"
 _PROPOSED = (
     "not varied: a forest proposes the initial poses of this variant, two for each of its trees"
 )
-_KEY_FRAMES = 4
-_FROM_THE_SIDE = ("surface", "dive")
-_MOST_DOTS = 1_500  # of a body
-_WINDOW_PX = 128
-_ABOVE_GROUND_MM = 4.0  # a pixel less far above the empty ground is noise
-_NEAR = 0.25  # of the body's length: points farther from every joint are noise
 
 
 @dataclass(frozen=True)
@@ -659,11 +649,12 @@ def _key_frames(scenario: Scenario) -> dict[str, Any]:
     stage = staged(scenario, rng)
     motion, steps, pose, _, _, species, camera, *_ = stage
     inside = np.flatnonzero(motion.word[steps] == scenario.word)
-    rows = np.linspace(0, len(inside) - 1, min(_KEY_FRAMES, len(inside))).round().astype(int)
-    (patches,) = rendered(rng, stage, inside[rows], _WINDOW_PX)
+    # at most four key frames
+    rows = np.linspace(0, len(inside) - 1, min(4, len(inside))).round().astype(int)
+    (patches,) = rendered(rng, stage, inside[rows], 128)
     joints = pose[inside].joints(species.skeleton)
     middle = joints.mean(axis=1)
-    side = scenario.word in _FROM_THE_SIDE
+    side = scenario.word in ("surface", "dive")
     axes = np.eye(3)[:2]
     if side:
         axes = np.array([[*_direction(middle), 0.0], [0.0, 0.0, 1.0]])
@@ -671,8 +662,10 @@ def _key_frames(scenario: Scenario) -> dict[str, Any]:
     for k, row in enumerate(rows):
         points = _visible_points(patches, k, camera.T_arena_camera)
         off = np.linalg.norm(points[:, None] - joints[row], axis=-1).min(axis=1)
-        body = points[off < _NEAR * species.skeleton.length]
-        bodies.append((body[:: max(1, -(-len(body) // _MOST_DOTS))] - middle[0]) @ axes.T)
+        # points farther from every joint are noise
+        body = points[off < 0.25 * species.skeleton.length]
+        # at most 1,500 points of a body
+        bodies.append((body[:: max(1, -(-len(body) // 1_500))] - middle[0]) @ axes.T)
     return {
         "word": scenario.word,
         "side": side,
@@ -687,7 +680,8 @@ def _key_frames(scenario: Scenario) -> dict[str, Any]:
 def _visible_points(patches: Patches, k: int, T_arena_camera: SE3) -> Array:
     """Points of patch k above the ground, (m, 3) mm, arena frame."""
     depth = patches.depth[k].astype(float)
-    v, u = np.nonzero((depth > 0) & (patches.background[k] - depth > _ABOVE_GROUND_MM))
+    # a pixel less than 4 mm above the empty ground is noise
+    v, u = np.nonzero((depth > 0) & (patches.background[k] - depth > 4.0))
     fx, fy, cx, cy = patches.intrinsics[k]
     z = depth[v, u]
     x = (u + patches.origin[k, 0] - cx) / fx * z

@@ -60,8 +60,6 @@ SCHEMA = 4
 _DIGITS = 6  # significant digits of a kept number
 _DEEP = re.compile(r"\n {5,}|\n {4}(?=[]}])")  # line breaks within a list or the numbers of a split
 _N_SESSIONS = 40
-_ILLUSTRATED = 128  # images behind the figures of candidates and convergence
-_TRACKED_FRAMES = 160
 _VERBS = {
     "tracking": "liex evaluate tracking --animal mouse --sequence easy --figure F.png",
     "actions": "liex evaluate actions --animal fish --out DIR",
@@ -70,8 +68,6 @@ _VERBS = {
 # a quick run
 _QUICK_FRAMES = 100
 _QUICK_ILLUSTRATED = 16
-_QUICK_TRACKED = 40
-_QUICK_STRIDE = 12  # use every so many-th cut-out sequence
 _QUICK_IMAGES = {"paper": 1_024, "rf": 2_048, "cnn": 2_048}
 QUICK_SWEEP = Sweep(
     n_images=512,
@@ -334,7 +330,8 @@ def results_of(
         row["other_processor"] = None if made_on == processor() else made_on
     curves = _sensitivities(skeleton, kept["sensitivity"], budget, command, missing, progress)
     progress(0, None, f"{skeleton.name}: candidates and convergence")
-    n_images = _QUICK_ILLUSTRATED if budget.quick else _ILLUSTRATED
+    # images behind the figures of candidates and convergence
+    n_images = _QUICK_ILLUSTRATED if budget.quick else 128
     examples = {name: row["examples"] for name, row in found.items()}
     failures = {name: found[name].get("failures") for name in SWEPT[::-1] if name in found}
     return {
@@ -458,13 +455,14 @@ def measure_further(
         further["tracking"] = evaluate_tracking(
             "mouse",
             "easy",
-            n_frames=_QUICK_TRACKED if quick else _TRACKED_FRAMES,
+            n_frames=40 if quick else 160,
             figure=folder / "fig18_tracking.png",
             progress=progress,
         )
         further["figures"].append(folder / "fig18_tracking.png")
     if "actions" not in without:
-        further["actions"] = _actions("fish", _QUICK_STRIDE if quick else 1, progress)
+        # a quick run uses every twelfth cut-out sequence
+        further["actions"] = _actions("fish", 12 if quick else 1, progress)
         further["key_frames"] = rows.acted_key_frames("fish")
     if nyu is None:
         why = f"no folder was named with --nyu; with the data `{_VERBS['nyu']}` makes it"
