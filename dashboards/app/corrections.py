@@ -37,7 +37,6 @@ from .desk import Desk, Desks, Stretch, coloured_actions
 Correct = Callable[[Path, Sequence[Correction], Sequence[int], str], object]
 Report = Callable[[Path], object]
 
-WAITING = "waiting"
 SAVED = "saved"
 FAILED = "failed"
 _CALM_S = 3.0  # time without a correction before the report is made again
@@ -65,7 +64,7 @@ class Ticket:
     undoes: int = 0
     id: int = 0
     number: int = 0
-    state: str = WAITING
+    state: str = "waiting"
 
 
 class Saver:

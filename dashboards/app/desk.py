@@ -254,15 +254,11 @@ def _plain(values: Any) -> Any:
 # object where the body jumps farther than it can move, and, with several animals in view, where
 # another one comes within a body's length or an animal is found again after a loss.
 
-ENDS = "ends"
-IDENTITY = "identity"
-_HUMAN = "human"
-
 
 def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretch]:
     """The crossings of a session in order of time.
 
-    Their kind is `ENDS` (head and tail) or `IDENTITY` (the animal and another object); `individual`
+    Their kind is `ends` (head and tail) or `identity` (the animal and another object); `individual`
     is the animal's name within the session.
 
     Args:
@@ -303,16 +299,16 @@ def _exchanged_ends(animal: SessionAnimal) -> Iterator[Stretch]:
         spans = own[["start_s", "stop_s"]].to_numpy(float)
         for run in _runs(*spans.T):
             times = f", {len(run)} times" if len(run) > 1 else ""
-            human = own["source"].iloc[run[0]] == _HUMAN
+            human = own["source"].iloc[run[0]] == "human"
             sure = "" if human else f" (p {own['p_flip'].iloc[run].max():.2f})"
             why = f"head and tail {text}{times}{sure}"
             start_s, stop_s = spans[run[0], 0], spans[run, 1].max()
-            yield _stretch(start_s, stop_s, ENDS, why, individual=animal.individual)
+            yield _stretch(start_s, stop_s, "ends", why, individual=animal.individual)
 
 
 def _flip_status(flip: dict[str, Any]) -> str:
     """The status of a row of the table `flips`, in words."""
-    if flip["source"] == _HUMAN:
+    if flip["source"] == "human":
         undone = isinstance(flip.get("undone_at"), str) and flip["undone_at"]
         return "were exchanged by a person, who took it back" if undone else "exchanged by a person"
     return "were exchanged and are corrected" if flip["applied"] else "perhaps exchanged"
@@ -330,7 +326,7 @@ def _jumps(session: Session, animal: SessionAnimal, spine_mm: float) -> Iterator
     for k in np.flatnonzero(far):
         jump = f"the body jumps {moved_mm[k]:.0f} mm from one frame to the next"
         why = f"{jump}: perhaps another object is followed"
-        yield _stretch(time_s[k], time_s[k + 1], IDENTITY, why, individual=animal.individual)
+        yield _stretch(time_s[k], time_s[k + 1], "identity", why, individual=animal.individual)
 
 
 def _meetings(
@@ -342,7 +338,7 @@ def _meetings(
     for run in _runs(time_s, time_s):
         why = f"{names} come within {away_mm[rows[run]].min():.0f} mm: {result}"
         start_s, stop_s = time_s[run[[0, -1]]]
-        yield _stretch(start_s, stop_s, IDENTITY, why, individual=animal.individual)
+        yield _stretch(start_s, stop_s, "identity", why, individual=animal.individual)
 
 
 def _found_again(animal: SessionAnimal) -> Iterator[Stretch]:
@@ -351,4 +347,4 @@ def _found_again(animal: SessionAnimal) -> Iterator[Stretch]:
     for start_s, stop_s in animal.lost_s:
         if start_s > 0.0 and stop_s < last_s:
             why = f"lost for {stop_s - start_s:.2f} s: perhaps another animal is followed since"
-            yield _stretch(start_s, stop_s, IDENTITY, why, individual=animal.individual)
+            yield _stretch(start_s, stop_s, "identity", why, individual=animal.individual)

@@ -40,7 +40,7 @@ from ..figures.style import (
     on_page,
     time_unit,
 )
-from ..report.contact_sheet import WORDS, scene_marks
+from ..report.contact_sheet import MARKS, scene_marks
 from ..report.report import warnings
 from ..units import shown, titled
 from . import tables
@@ -434,7 +434,7 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
         "headline": f"{', '.join(stated)} · {extent}" if stated else extent,
         "warnings": warnings(session),
         "author": author_name(),
-        "scene": [(kind, WORDS[kind]) for kind in kinds],
+        "scene": [(kind, MARKS[kind][0]) for kind in kinds],
         "arena": f"/arena/{path}",
         "report": f"/report/{path}" if session.has("report.html") else "",
         "files": files,

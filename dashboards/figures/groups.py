@@ -39,6 +39,7 @@ from .style import (
     heading,
     key_rows,
     name_rows,
+    one_panel,
     panel,
     sheet,
     time_unit,
@@ -85,10 +86,12 @@ def ethograms(animals: Sequence[SessionAnimal]) -> Figure | None:
     unit, size = time_unit(duration)
     height = max(3.4 * len(rows), 8.0)
     bottom = 8.0 + 4.0 * key_rows(words)
-    figure = sheet(TWO_COLUMNS_MM, height + bottom + 9.0)
     width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM - 8.0
-    axes = panel(figure, LEFT_MM + 8.0, bottom, width, height)
-    axes.set_title(f"Ethograms, n = {counted(len(rows), 'session')}, {counted(n, 'bout')}")
+    figure, axes = one_panel(
+        (TWO_COLUMNS_MM, height + bottom + 9.0),
+        (LEFT_MM + 8.0, bottom, width, height),
+        f"Ethograms, n = {counted(len(rows), 'session')}, {counted(n, 'bout')}",
+    )
     colours = action_colours(words)
     hair_s = 0.05 * duration / width
     for k, (_, animal) in enumerate(rows):
@@ -140,8 +143,10 @@ def budgets_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
     if not words or not any(np.isfinite(values).any() for values in shares.values()):
         return None
     height = (2.0 + 3.2 * len(groups)) * len(words)
-    figure = sheet(ONE_COLUMN_MM, height + 16.0 + 4.0 * len(groups))
-    axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - RIGHT_MM, height)
+    figure, axes = one_panel(
+        (ONE_COLUMN_MM, height + 16.0 + 4.0 * len(groups)),
+        (LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - RIGHT_MM, height),
+    )
     n = sum(len(values) for values in shares.values())
     heading(figure, f"Time budget: every subject, and the mean, n = {counted(n, 'subject')}")
     apart = 0.8 / len(groups)
@@ -178,9 +183,12 @@ def distance_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
         return None
     duration = max(animal.duration_s for animal in animals)
     unit, size = time_unit(duration)
-    figure = sheet(ONE_COLUMN_MM, 58.0 + 3.5 * len(groups))
-    axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 40.0)
     lines = [f"{group}, n = {counted(len(some), 'session')}" for group, some in walks.items()]
+    figure, axes = one_panel(
+        (ONE_COLUMN_MM, 58.0 + 3.5 * len(groups)),
+        (12.0, 9.0, ONE_COLUMN_MM - 17.0, 40.0),
+        "\n".join(["Cumulative distance: sessions, and the mean", *lines]),
+    )
     for group, some in walks.items():
         colour = group_colour(group, list(groups))
         for time_s, metres, _ in some:
@@ -191,8 +199,7 @@ def distance_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
             grid = np.linspace(0.0, min(float(time_s[-1]) for time_s, _, _ in known), 400)
             mean = np.mean([np.interp(grid, time_s, metres) for time_s, metres, _ in known], axis=0)
             axes.plot(grid / size, mean, color=colour, linewidth=1.5, label=group)
-    title = "\n".join(["Cumulative distance: sessions, and the mean", *lines])
-    axes.set(xlabel=f"time, {unit}", ylabel="distance, m", title=title)
+    axes.set(xlabel=f"time, {unit}", ylabel="distance, m")
     axes.set(xlim=(0.0, duration / size), ylim=(0.0, None))
     axes.grid(color=LINE, linewidth=0.4)
     axes.legend(loc="upper left")
@@ -266,8 +273,10 @@ def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
     known = stats[np.isfinite(stats["effect_size"].astype(float))].reset_index(drop=True)
     if known.empty:
         return None
-    figure = sheet(TWO_COLUMNS_MM, 4.2 * len(known) + 20.0)
-    axes = panel(figure, 78.0, 11.0, TWO_COLUMNS_MM - 84.0, 4.2 * len(known))
+    figure, axes = one_panel(
+        (TWO_COLUMNS_MM, 4.2 * len(known) + 20.0),
+        (78.0, 11.0, TWO_COLUMNS_MM - 84.0, 4.2 * len(known)),
+    )
     _intervals(axes, known, "effect_size", "effect_low", "effect_high", 1.0)
     axes.set_yticks(
         range(len(known)),

@@ -27,12 +27,15 @@ from .style import (
     floor_limits,
     halo,
     heading,
+    one_panel,
     panel,
     scale_bar,
     sheet,
     time_unit,
 )
 
+# one column with a square panel, space for a colour bar, and a title
+_FLOOR = ((ONE_COLUMN_MM, 86.0), (2.0, 7.0, 69.0, 69.0))
 _ACROSS = 3  # panels per row
 
 
@@ -177,9 +180,10 @@ def occupancy_map(animal: SessionAnimal) -> Figure | None:
     found = occupancy_of(animal)
     if found.n == 0 or axis_of(animal.session.metadata["animal"]).kind == BRANCHES:
         return None
-    figure, axes = _floor_sheet(
+    figure, axes = one_panel(
+        *_FLOOR,
         f"Occupancy, {animal.who}\nn = {counted(found.n, 'frame')}, "
-        f"{found.observed_s:.1f} s observed"
+        f"{found.observed_s:.1f} s observed",
     )
     image = draw_occupancy(axes, found, _most(found))
     draw_outlines(axes, animal.session)
@@ -192,9 +196,10 @@ def trajectory(animal: SessionAnimal) -> Figure | None:
     known = np.isfinite(animal.xy_mm).all(axis=1)
     if not known.any() or axis_of(animal.session.metadata["animal"]).kind == BRANCHES:
         return None
-    figure, axes = _floor_sheet(
+    figure, axes = one_panel(
+        *_FLOOR,
         f"Trajectory, {animal.who}\nn = {counted(int(known.sum()), 'frame')}, "
-        f"{animal.hold_s[known].sum():.1f} s observed"
+        f"{animal.hold_s[known].sum():.1f} s observed",
     )
     unit, size = time_unit(animal.duration_s)
     clock = Normalize(0.0, max(animal.duration_s, 1e-9) / size)
@@ -265,10 +270,11 @@ def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure |
         return None
     heights, x_mm, y_mm = arena_heights(session, depth)
     fixtures = session.metadata.get("scene", {}).get("fixtures", [])
-    figure, axes = _floor_sheet(
+    figure, axes = one_panel(
+        *_FLOOR,
         f"Arena, heights above the floor, {session.name}\n"
         f"{session.arena}; {counted(len(fixtures), 'fixture')}; n = "
-        f"{counted(len(depth), 'image')}"
+        f"{counted(len(depth), 'image')}",
     )
     known = heights[np.isfinite(heights)]
     top = float(np.percentile(known, 99.0)) if len(known) else 10.0
@@ -331,16 +337,8 @@ def _most(found: Occupancy) -> float:
     return float(np.percentile(visited, 99.0)) if len(visited) else 1.0
 
 
-def _floor_sheet(title: str) -> tuple[Figure, Axes]:
-    """A one-column figure with a square panel, space for a colour bar, and a title."""
-    figure = sheet(ONE_COLUMN_MM, 86.0)
-    axes = panel(figure, 2.0, 7.0, 69.0, 69.0)
-    axes.set_title(title)
-    return figure, axes
-
-
 def _finished(figure: Figure, image: Any, label: str, low_mm: Array, high_mm: Array) -> Figure:
-    """A figure of `_floor_sheet` with its limits, scale bar and colour bar."""
+    """A figure of the floor with its limits, scale bar and colour bar."""
     floor_limits(figure.axes[0], low_mm, high_mm)
     scale_bar(figure.axes[0])
     _colour_bar(figure, image, label)

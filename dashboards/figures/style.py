@@ -120,6 +120,16 @@ def panel(
     return figure.add_axes(place)
 
 
+def one_panel(
+    size_mm: tuple[float, float], box_mm: tuple[float, float, float, float], title: str = ""
+) -> tuple[Figure, Axes]:
+    """A figure of a size with one panel at a position, see `panel`, and the panel's title."""
+    figure = sheet(*size_mm)
+    axes = panel(figure, *box_mm)
+    axes.set_title(title)
+    return figure, axes
+
+
 def heading(figure: Figure, text: str) -> None:
     """A title at the upper left corner of a figure, possibly of several lines."""
     across, up = figure.get_size_inches() * 25.4

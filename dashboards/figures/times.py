@@ -31,6 +31,7 @@ from .style import (
     heading,
     key_rows,
     name_rows,
+    one_panel,
     panel,
     sheet,
     time_unit,
@@ -38,6 +39,7 @@ from .style import (
 
 _MOST_COLUMNS = 1200  # of a curve; more points cannot be distinguished on a page
 _CURVE_MM = 17.0
+_SMALL_BOX = (12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
 _BESIDE_S = 0.2  # margin of a stretch, so that its curves reach its ends
 
 
@@ -63,12 +65,11 @@ def ethogram(animal: SessionAnimal, span_s: Span | None = None) -> Figure | None
     if not words and not len(animal.lost_s):
         return None
     height = 4.0 * max(len(words), 1)  # a lane's height, mm
-    figure = sheet(TWO_COLUMNS_MM, height + 15.0)
-    width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
-    axes = panel(figure, LEFT_MM, 8.0, width, height)
-    bouts = animal.bouts
-    axes.set_title(
-        f"Ethogram, {animal.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame"
+    width, bouts = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM, animal.bouts
+    figure, axes = one_panel(
+        (TWO_COLUMNS_MM, height + 15.0),
+        (LEFT_MM, 8.0, width, height),
+        f"Ethogram, {animal.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame",
     )
     _, size = time_unit(last_s - first_s)
     # bouts closer than 0.05 mm on paper are one bar
@@ -145,11 +146,8 @@ def cumulative_distance(animal: SessionAnimal) -> Figure | None:
         return None
     time_s, metres, n = walked(animal)
     _, size = time_unit(animal.duration_s)
-    figure = sheet(ONE_COLUMN_MM, 52.0)
-    axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
-    axes.set_title(
-        f"Cumulative distance, {animal.who}\n{metres[-1]:.2f} m, n = {counted(n, 'frame')}"
-    )
+    title = f"Cumulative distance, {animal.who}\n{metres[-1]:.2f} m, n = {counted(n, 'frame')}"
+    figure, axes = one_panel((ONE_COLUMN_MM, 52.0), _SMALL_BOX, title)
     rows = kept_rows(metres, _MOST_COLUMNS)
     axes.plot(time_s[rows] / size, metres[rows], color=BLUE, linewidth=1.0)
     axes.set(ylabel="distance, m", ylim=(0.0, None))
@@ -210,9 +208,8 @@ def distribution(
         np.minimum(values, top), bins=30, range=(0.0, top), weights=hold_s[known]
     )
     share = 100.0 * share / max(share.sum(), 1e-9)
-    figure = sheet(ONE_COLUMN_MM, 52.0)
-    axes = panel(figure, 12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
-    axes.set_title(f"{title}, {animal.who}\nn = {counted(len(values), 'frame')}")
+    title = f"{title}, {animal.who}\nn = {counted(len(values), 'frame')}"
+    figure, axes = one_panel((ONE_COLUMN_MM, 52.0), _SMALL_BOX, title)
     axes.bar(edges[:-1], share, np.diff(edges), align="edge", color=colour, gid="distribution")
     median = float(np.median(values))
     axes.axvline(median, color=INK, linewidth=0.7, linestyle=(0, (3, 2)))
@@ -284,8 +281,10 @@ def time_budget(animal: SessionAnimal) -> Figure | None:
         return None
     shares = np.nan_to_num([100.0 * float(row[f"{word}_share"]) for word in words])
     n_bouts = [int(row[f"{word}_count"]) if f"{word}_count" in row else None for word in words]
-    figure = sheet(ONE_COLUMN_MM, 4.0 * len(words) + 22.0)
-    axes = panel(figure, LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - 12.0, 4.0 * len(words))
+    figure, axes = one_panel(
+        (ONE_COLUMN_MM, 4.0 * len(words) + 22.0),
+        (LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - 12.0, 4.0 * len(words)),
+    )
     heading(figure, f"Time budget, {animal.who}\nn = {counted(len(animal.bouts), 'bout')}")
     axes.barh(range(len(words)), shares, 0.76, color=[colours[word] for word in words])
     for k, (share, n) in enumerate(zip(shares, n_bouts, strict=True)):
@@ -327,11 +326,11 @@ def activity(animal: SessionAnimal) -> Figure | None:
     colours["unlabelled"] = UNLABELLED_COLOUR
     present = [word for word, seconds in spent.items() if seconds.sum() > 1e-6]
     low = 9.0 + 4.0 * key_rows(present)
-    figure = sheet(TWO_COLUMNS_MM, low + 31.0)
-    axes = panel(figure, LEFT_MM, low, TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM, 23.0)
-    axes.set_title(
+    figure, axes = one_panel(
+        (TWO_COLUMNS_MM, low + 31.0),
+        (LEFT_MM, low, TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM, 23.0),
         f"Shares over the session, {animal.who}, n = {counted(len(table), 'interval')} of "
-        f"{stop[0] - start[0]:.3g} s"
+        f"{stop[0] - start[0]:.3g} s",
     )
     below = np.zeros(len(table))
     for word, seconds in spent.items():

@@ -37,13 +37,15 @@ _NYU_METHODS = {
     "generalized_feedback": "Generalized\nFeedback",
     "deepprior": "DeepPrior",
 }
-_NYU_BONES = (
-    *((f"{finger}_tip", f"{finger}_mid") for finger in ("pinky", "ring", "middle", "index")),
-    *((f"{finger}_mid", "palm") for finger in ("pinky", "ring", "middle", "index")),
-    *(("thumb_tip", "thumb_mid"), ("thumb_mid", "thumb_base"), ("thumb_base", "palm")),
-    *(("wrist_a", "palm"), ("wrist_b", "palm")),
-)
-_NYU_EDGES = [(list(POINTS).index(a), list(POINTS).index(b)) for a, b in _NYU_BONES]
+_NYU_EDGES = [
+    (list(POINTS).index(a), list(POINTS).index(b))
+    for a, b in (
+        *((f"{finger}_tip", f"{finger}_mid") for finger in ("pinky", "ring", "middle", "index")),
+        *((f"{finger}_mid", "palm") for finger in ("pinky", "ring", "middle", "index")),
+        *(("thumb_tip", "thumb_mid"), ("thumb_mid", "thumb_base"), ("thumb_base", "palm")),
+        *(("wrist_a", "palm"), ("wrist_b", "palm")),
+    )
+]
 _TRACKERS = {  # row: (name in the legend, colour, width)
     "single": ("single frames", "#999999", 1.0),
     "algorithm3": ("Algorithm 3 on our parts", "#4477AA", 0.8),
@@ -244,6 +246,9 @@ def _pose(panel: Axes, one: Mapping[str, Any], side: bool) -> None:
         _depth(panel, one["depth"], middle - 1.6 * reach, middle + reach, "gray")
         panel.set_facecolor("#dfe3e6")
         flat = camera.project
+        ends_px = [flat(truth).min(axis=0), flat(truth).max(axis=0)]
+        reach_px = max(0.85 * float(np.ptp(ends_px, axis=0).max()), 12.0)
+        _around(panel, np.mean(ends_px, axis=0), reach_px)
     else:
         plane = [0, 2] if side else [0, 1]
         half = (0.75 if side else 0.65) * max(float((high - low)[: 3 if side else 2].max()), 1.0)
@@ -264,8 +269,6 @@ def _pose(panel: Axes, one: Mapping[str, Any], side: bool) -> None:
     if pose is not None:
         _bones(panel, flat(pose), edges, _POSE, 1.4)
         result = f"{np.linalg.norm(pose - truth, axis=-1).mean():.1f} mm"
-    if camera is not None and not side:
-        panel.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
     panel.set_title(f"{one['head']}\n{result}", fontsize=8)
 
 

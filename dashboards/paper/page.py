@@ -50,8 +50,11 @@ _FIGURES = {  # by label, names of the files
     "Fig. 14": "fig13_candidates_mouse.png",
     "Fig. 15": "fig13_candidates_hand.png",
 }
-_ANIMAL = {"Fig. 10": "hand", "Fig. 11": "hand", "Fig. 13": "fish", "Fig. 14": "mouse"}
-_ANIMAL |= {"Fig. 15": "hand"}
+_ANIMAL = {
+    **dict.fromkeys(("Fig. 10", "Fig. 11", "Fig. 15"), "hand"),
+    "Fig. 13": "fish",
+    "Fig. 14": "mouse",
+}
 _PART = {"Fig. 18": "tracking", "Fig. 19": "actions", "Fig. 20": "actions"}
 
 

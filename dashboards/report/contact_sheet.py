@@ -24,25 +24,12 @@ from ..figures.animals import Array, read_cutout
 from ..figures.places import hidden_places, in_image
 from ..video.film import Relief, scale_mm
 
-REGION = "region"
-OUTLINE = "outline"
-FIXTURE = "fixture"
-HIDDEN = "hidden"
-BESIDE = "beside"
-WORDS = {
-    REGION: "region outside of which nothing is analysed",
-    OUTLINE: "walls that were found",
-    FIXTURE: "fixture, with its height",
-    HIDDEN: "where an animal hid, and when",
-    BESIDE: "another animal in view",
-}
-# colour and dashes (in widths of the line) of each
-_STYLES = {
-    REGION: ("#fff", "1 2.5"),
-    OUTLINE: ("#fff", ""),
-    FIXTURE: ("#ffd24a", ""),
-    HIDDEN: ("#ff8ad4", ""),
-    BESIDE: ("#ffd24a", "2 1.5"),
+MARKS = {  # kind: its words, colour, and dashes in widths of the line
+    "region": ("region outside of which nothing is analysed", "#fff", "1 2.5"),
+    "outline": ("walls that were found", "#fff", ""),
+    "fixture": ("fixture, with its height", "#ffd24a", ""),
+    "hidden": ("where an animal hid, and when", "#ff8ad4", ""),
+    "beside": ("another animal in view", "#ffd24a", "2 1.5"),
 }
 
 
@@ -64,18 +51,18 @@ class Mark:
 def scene_marks(session: Session) -> list[Mark]:
     """The scene of a session in image coordinates; objects that were not found are left out."""
     scene = session.metadata.get("scene") or {}
-    region = Mark(REGION, np.array(scene.get("region_px") or np.empty((0, 2)), float))
-    outline = Mark(OUTLINE, in_image(session, session.arena.outline_mm()))
+    region = Mark("region", np.array(scene.get("region_px") or np.empty((0, 2)), float))
+    outline = Mark("outline", in_image(session, session.arena.outline_mm()))
     made = [mark for mark in (region, outline) if len(mark.points_px) >= 3]
     for fixture in map(Fixture.from_dict, scene.get("fixtures") or []):
         centre = in_image(session, np.array([fixture.centre_mm]), fixture.height_mm)
-        made.append(Mark(FIXTURE, centre, str(fixture)))
+        made.append(Mark("fixture", centre, str(fixture)))
     hidden = hidden_places(session)
     # the 24 longest ones
     longest = np.argsort(hidden[:, 2] - hidden[:, 3], kind="stable")[:24]
     for x, y, start, stop in hidden[np.sort(longest)]:
         made.append(
-            Mark(HIDDEN, in_image(session, np.array([[x, y]])), f"{start:.1f} to {stop:.1f} s")
+            Mark("hidden", in_image(session, np.array([[x, y]])), f"{start:.1f} to {stop:.1f} s")
         )
     return [mark for mark in made if len(mark.points_px)]
 
@@ -106,7 +93,7 @@ def svg_marks(
         points = mark.points_px - [left, top] + 0.5
         if (points.max(axis=0) < 0).any() or (points.min(axis=0) > [width, height]).any():
             continue
-        colour, dashes = _STYLES[mark.kind]
+        words, colour, dashes = MARKS[mark.kind]
         of = " ".join(f"{0.8 * unit * float(part):.2f}" for part in dashes.split())
         dashed = f' stroke-dasharray="{of}"' if of else ""
         name, path = _shape(mark.kind, points, 1.8 * unit)
@@ -115,11 +102,11 @@ def svg_marks(
             f'stroke-width="{1.8 * unit:.2f}"/>'
             f'<{name} {path} class="{mark.kind}" fill="none" stroke="{colour}" '
             f'stroke-width="{0.8 * unit:.2f}"{dashed}>'
-            f"<title>{escape(f'{WORDS[mark.kind]} {mark.label}'.strip())}</title></{name}>"
+            f"<title>{escape(f'{words} {mark.label}'.strip())}</title></{name}>"
         )
         if mark.label and lettered:
             # the size of the letters and the offset of the label, in units
-            size, offset = (6.0, (16.0, 2.0)) if mark.kind == BESIDE else (4.0, (2.4, -1.2))
+            size, offset = (6.0, (16.0, 2.0)) if mark.kind == "beside" else (4.0, (2.4, -1.2))
             x, y = points[0] + unit * np.array(offset)
             parts.append(
                 f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size * unit:.2f}" fill="{colour}" '
@@ -134,9 +121,9 @@ def _shape(kind: str, points: Array, r: float) -> tuple[str, str]:
     if len(points) > 1:
         return "polygon", f'points="{" ".join(f"{x:.1f},{y:.1f}" for x, y in points)}"'
     x, y = points[0]
-    if kind == BESIDE:
+    if kind == "beside":
         return "circle", f'cx="{x:.1f}" cy="{y:.1f}" r="{7 * r:.1f}"'
-    if kind == FIXTURE:
+    if kind == "fixture":
         return "path", f'd="M{x - r:.1f} {y:.1f}H{x + r:.1f}M{x:.1f} {y - r:.1f}V{y + r:.1f}"'
     d = 2 * r
     cross = f"M{x - r:.1f} {y - r:.1f}l{d:.1f} {d:.1f}m0 {-d:.1f}l{-d:.1f} {d:.1f}"
@@ -252,7 +239,7 @@ def whole_image(session: Session) -> tuple[str, str] | None:
     entry = session.metadata.get("whole_picture")
     if not entry:
         return None
-    beside = Mark(BESIDE, np.array([entry["beside_px"]], float), "not measured")
+    beside = Mark("beside", np.array([entry["beside_px"]], float), "not measured")
     marks = [*scene_marks(session), beside]
     unit = session.camera.width / 250.0
     drawn = _drawn(session, [entry], marks, unit=unit, lettered=True)

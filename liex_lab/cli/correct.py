@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from liex_lab import api
-from liex_lab.cli.options import group_of_verbs, print_table, say
+from liex_lab.cli.options import SessionPath, group_of_verbs, print_table, say
 from liex_lab.errors import SessionError
 from liex_lab.runtime.progress import progress_bar
 
@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 
 correct = group_of_verbs("Correct a session; corrections are kept in its folder and can be undone.")
 
-SessionPath = Annotated[
-    Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
-]
 Author = Annotated[
     str,
     typer.Option(
@@ -29,10 +26,6 @@ Author = Annotated[
         metavar="NAME",
         help="Author of the correction; default: the current account.",
     ),
-]
-NewWord = Annotated[
-    bool,
-    typer.Option("--new-word", help="Allow an action that is not in the ethogram's vocabulary."),
 ]
 
 
@@ -96,7 +89,12 @@ def bout(
             "--labels", metavar="FILE", help="Import a whole ethogram: .csv, .parquet or .boris."
         ),
     ] = None,
-    new_word: NewWord = False,
+    new_word: Annotated[
+        bool,
+        typer.Option(
+            "--new-word", help="Allow an action that is not in the ethogram's vocabulary."
+        ),
+    ] = False,
     by: Author = "",
 ) -> None:
     """Edit bouts: rename, move, delete or add one, or import a whole ethogram.

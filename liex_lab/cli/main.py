@@ -10,7 +10,7 @@ import shlex
 import sys
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -55,9 +55,6 @@ from liex_lab.cli.sessions import (
 from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime import durable, memory, processes
 from liex_lab.runtime.progress import progress_bar
-
-if TYPE_CHECKING:
-    pass
 
 # exit code of internal errors (EX_SOFTWARE); errors that the user can correct are 1, usage errors 2
 FAULT = 70
@@ -326,26 +323,18 @@ def info(
     from liex_lab.catalog import bundled_models
     from liex_lab.sessions.provenance import versions
 
-    facts: dict[str, Any] = versions()
-    if not everything:
-        facts = {name: facts[name] for name in ("liex_lab", "python")}
-    facts["plans"] = ", ".join(known_plans())
-    models = bundled_models()
-    facts["models"] = ", ".join(models) or "none"
-    if not everything:
-        facts |= {
-            f"model {name}": f"sha256 {str(card.get('sha256', 'unknown'))[:16]}"
-            for name, card in models.items()
-        }
-        tell_numbers(facts)
-        say("`liex info --all` lists every package and how the models were made")
-        return
-    facts |= {
-        f"model {name}: {key}": value
-        for name, card in models.items()
-        for key, value in card.items()
-    }
+    models, packages = bundled_models(), versions()
+    shown = packages if everything else ("liex_lab", "python")
+    facts: dict[str, Any] = {name: packages[name] for name in shown}
+    facts |= {"plans": ", ".join(known_plans()), "models": ", ".join(models) or "none"}
+    for name, card in models.items():
+        if everything:
+            facts |= {f"model {name}: {key}": value for key, value in card.items()}
+        else:
+            facts[f"model {name}"] = f"sha256 {str(card.get('sha256', 'unknown'))[:16]}"
     tell_numbers(facts)
+    if not everything:
+        say("`liex info --all` lists every package and how the models were made")
 
 
 def main() -> None:

@@ -105,9 +105,7 @@ def compare(
 
 
 def report(
-    session: Annotated[
-        Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
-    ],
+    session: SessionPath,
 ) -> None:
     """Regenerate a session's report.html, with all corrections."""
     from liex_lab.dashboards.report.report import write_report
@@ -437,28 +435,14 @@ def pack(
 # The commands of `liex` for studies.
 
 
-StudyOrInit = Annotated[
-    str, typer.Argument(metavar="STUDY|init", help="A study's .toml file; init creates one.")
-]
-InitFolder = Annotated[
-    Path | None, typer.Argument(metavar="[FOLDER]", help="With init: the folder of the recordings.")
-]
-OnlyIds = Annotated[
-    list[str] | None,
-    typer.Option("--only", metavar="ID", help="Measure only this session; repeatable."),
-]
-Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")
-]
-SlurmFile = Annotated[
-    str | None,
-    typer.Option("--slurm", metavar="FILE", help="Settings of Slurm jobs, .toml."),
-]
-
-
 def cohort(
-    study: StudyOrInit,
-    folder: InitFolder = None,
+    study: Annotated[
+        str, typer.Argument(metavar="STUDY|init", help="A study's .toml file; init creates one.")
+    ],
+    folder: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FOLDER]", help="With init: the folder of the recordings."),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the status of each session without measuring.")
     ] = False,
@@ -467,12 +451,20 @@ def cohort(
         bool,
         typer.Option("--again", help="Measure all sessions again, including those that are done."),
     ] = False,
-    only: OnlyIds = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="ID", help="Measure only this session; repeatable."),
+    ] = None,
     workers: Annotated[
         int, typer.Option("--workers", min=0, help="Number of processes; 0: one per two cores.")
     ] = 0,
-    scheduler: Scheduler = None,
-    slurm: SlurmFile = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", help="Address of a running Dask scheduler.")
+    ] = None,
+    slurm: Annotated[
+        str | None,
+        typer.Option("--slurm", metavar="FILE", help="Settings of Slurm jobs, .toml."),
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="With init: replace an existing study file.")
     ] = False,
@@ -553,9 +545,7 @@ def page_that_opens(address: str, folder: Path) -> Path:
 
 
 def verify(
-    session: Annotated[
-        Path, typer.Argument(metavar="SESSION", help="A session folder, NAME.liex.")
-    ],
+    session: SessionPath,
     recording: Annotated[
         Path | None,
         typer.Option("--recording", help="Measure this recording again and compare the tables."),

@@ -94,7 +94,7 @@ class PointMotion:
         """Rates of change (m,) of position, direction and angles; {} without a frame rate."""
         if self.rate_hz is None or self.clips is None:
             return {}
-        lag = max(1, round(self.rate_hz / 30.0))  # about 1/30 s
+        lag = max(1, round(self.rate_hz * (1.0 / 30.0)))
         together = self.clips[lag:] == self.clips[:-lag]
         per_s = self.rate_hz / lag
         rump, neck = self.points_mm[:, 0], self.points_mm[:, 3]
@@ -127,9 +127,9 @@ def motion_figures(real: PointMotion, virtual: dict[str, PointMotion]) -> dict[s
     Returns:
         `quantiles`: by measure, then by animal, the 5 %, 50 % and 95 % quantiles; `outside`: by
             virtual animal, then by measure, the share of real frames outside its range;
-            `nearest_degrees`: by virtual animal, the median and the 95 % quantile; `lean_degrees`: the real animal's
-            median bend and turn with their signs, 0 without a lean to one side. See
-            `MOTION_PROTOCOL`.
+            `nearest_degrees`: by virtual animal, the median and the 95 % quantile; `lean_degrees`:
+            the real animal's median bend and turn with their signs, 0 without a lean to one side.
+            See `MOTION_PROTOCOL`.
     """
     own, posture = _shown(real), real.posture()
     others = {name: _shown(one) for name, one in virtual.items()}

@@ -10,7 +10,7 @@ or development. `liex evaluate sizes` repeats `clean` over animals of several le
 evaluate reference` compares a session with another program's centroid and axis.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -35,7 +35,6 @@ from liex_lab.evaluation.scores import (
 )
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene.height_maps import Segmenter
 from liex_lab.sessions import Session
 from liex_lab.simulation import simulator, species
 from liex_lab.simulation.recording import TrueRecording
@@ -130,43 +129,29 @@ def unpacked(subject: Subject, found: Estimates | Guesses) -> tuple[Array, Array
     )
 
 
-def measure(
-    subject: Subject, frames: NDArray[np.float32], scene: Segmenter
-) -> tuple[Array, Array, Array]:
-    """A subject's estimates in frames (n, H, W) mm, at the size that it estimates from them.
-
-    Returns:
-        As `unpacked`.
-    """
-    return unpacked(subject, subject.estimate(frames, scene, subject.find_size(frames, scene)))
-
-
 def errors_of(
-    subjects: Mapping[str, Subject],
-    sessions: Sequence[TrueRecording],
-    plan: Plan,
-    progress: Progress,
-) -> dict[str, PoseErrors]:
-    """Errors of several subjects over rendered recordings, all on the same background subtraction.
+    subject: Subject, sessions: Sequence[TrueRecording], plan: Plan, progress: Progress
+) -> PoseErrors:
+    """Errors of a subject over rendered recordings.
 
     Each recording is processed as by `liex run`: background learned, size estimated, all frames.
 
     Args:
-        subjects: estimators and baselines by name, of one animal.
+        subject: an estimator or a baseline.
         sessions: recordings with their truth.
         plan: thresholds of the foreground, and expected sizes.
         progress: called recording by recording.
     """
-    parts: dict[str, list[PoseErrors]] = {name: [] for name in subjects}
-    skeleton = next(iter(subjects.values())).skeleton
+    parts: list[PoseErrors] = []
+    skeleton = subject.skeleton
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
         scene, frames = build_scene(recording, plan, skeleton, len(recording))
-        for name, subject in subjects.items():
-            joints, *predicted = measure(subject, frames, scene)
-            truth = recording.joints_camera
-            parts[name].append(PoseErrors.compare(joints, truth, skeleton.tip, *predicted))
-    return {name: PoseErrors.join(some) for name, some in parts.items()}
+        found = subject.estimate(frames, scene, subject.find_size(frames, scene))
+        joints, *predicted = unpacked(subject, found)
+        truth = recording.joints_camera
+        parts.append(PoseErrors.compare(joints, truth, skeleton.tip, *predicted))
+    return PoseErrors.join(parts)
 
 
 def evaluate_pose(
@@ -205,7 +190,7 @@ def evaluate_pose(
     subject = subject_of(animal, variant, progress, model)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
-    errors = errors_of({variant: subject}, sessions, plan_of(animal), progress)[variant]
+    errors = errors_of(subject, sessions, plan_of(animal), progress)
     how = f"{len(sessions)} rendered recordings of {len(sessions[0])} frames, {world.protocol}"
     return {
         "animal": animal,

@@ -22,7 +22,7 @@ result.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -37,6 +37,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.evaluation.scores import TRACKING_PROTOCOL, Followed, tracking_figures
 from liex_lab.plan import Plan
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.processes import threads
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
@@ -255,45 +256,43 @@ def follow(
         base_rounds: see `ParticleFilter`.
         seed: of the steps and of the selection.
     """
-    skeleton = estimator.skeleton
     rng = np.random.default_rng(seed)
     particles = ParticleFilter(estimator, scene, size, rng, noise, base_rounds)
-    joints = np.full((len(recording), skeleton.n_joints, 3), np.nan)
-    error = np.full(len(recording), np.nan)
-    began = time.perf_counter()
-    for frames in recording.chunks(_CHUNK):
-        for frame in frames:
-            step = particles.step(frame)
-            if step is not None:
-                joints[frame.index] = step[0].joints(skeleton)
-                error[frame.index] = step[1]
-    return _followed(recording, estimator, joints, error, time.perf_counter() - began)
+
+    def estimate(frames: Sequence[DepthFrame]) -> tuple[Array, Array]:
+        joints = np.full((len(frames), estimator.skeleton.n_joints, 3), np.nan)
+        error = np.full(len(frames), np.nan)
+        for k, frame in enumerate(frames):
+            if (step := particles.step(frame)) is not None:
+                joints[k], error[k] = step[0].joints(estimator.skeleton), step[1]
+        return joints, error
+
+    return _followed(recording, estimator, estimate)
 
 
 def _single(
     recording: simulator.TestSequence, paper: PoseEstimator, scene: Segmenter, size: float
 ) -> Followed:
     """Algorithm 1 on each frame by itself."""
-    joints, error = [], []
-    began = time.perf_counter()
-    for frames in recording.chunks(_CHUNK):
-        depths = np.stack([frame.depth for frame in frames])
-        chosen = paper.estimate(depths, scene, size).chosen
-        joints.append(chosen.pose.joints(paper.skeleton))
-        error.append(chosen.error_mm)
-    seconds = time.perf_counter() - began
-    return _followed(recording, paper, np.concatenate(joints), np.concatenate(error), seconds)
+
+    def estimate(frames: Sequence[DepthFrame]) -> tuple[Array, Array]:
+        chosen = paper.estimate(np.stack([frame.depth for frame in frames]), scene, size).chosen
+        return chosen.pose.joints(paper.skeleton), chosen.error_mm
+
+    return _followed(recording, paper, estimate)
 
 
 def _followed(
     recording: simulator.TestSequence,
     estimator: PoseEstimator,
-    joints: Array,
-    error: Array,
-    seconds: float,
+    estimate: Callable[[Sequence[DepthFrame]], tuple[Array, Array]],
 ) -> Followed:
-    """A row from joints (n, J, 3) mm in the camera frame and expected errors (n,) mm."""
+    """A row from each chunk's joints (n, J, 3) mm, camera frame, and expected errors (n,) mm."""
     skeleton = estimator.skeleton
+    began = time.perf_counter()
+    parts = [estimate(frames) for frames in recording.chunks(_CHUNK)]
+    seconds = time.perf_counter() - began
+    joints, error = (np.concatenate(some) for some in zip(*parts, strict=True))
     share = np.array(estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints)
     sd_mm = np.repeat((error[:, None] * share / np.sqrt(3.0))[..., None], 3, axis=-1)
     joints_arena, truth = recording.T_arena_camera @ joints, recording.joints_arena

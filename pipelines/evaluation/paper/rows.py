@@ -60,7 +60,6 @@ TRAINING_DRAWS = {"paper": 3, "paper-one-pose": 3, "paper-no-metric": 3}
 START_DRAWS = 5  # draws of the only initial pose, for each training
 _RATE_FRAMES = 128
 _RATE_REPEATS = 3
-_MARGIN = 0.35  # of the longest side of the true joints' rectangle
 _DIGITS = 2  # of a joint's position, mm
 
 
@@ -164,7 +163,8 @@ def measured(
         cut: cache of height maps by size and view, shared by subjects; filled.
 
     Returns:
-        As `pose.measure`: joints (n, J, 3) mm, camera frame; predicted error (n,) mm; factors (2,).
+        As `pose.unpacked`: joints (n, J, 3) mm, camera frame; predicted error (n,) mm; factors
+        (2,).
     """
     answer: Callable[..., Estimates | Guesses]
     if isinstance(subject, PoseEstimator):
@@ -350,14 +350,22 @@ def shown_poses(
         tests: recordings with their truth.
 
     Returns:
-        By variant, for each frame `head`; `depth` (h, w) float32 mm around the animal, 0 where
-        unread; `camera` of that part; `edges`; `spine_mm`; `truth` (J, 3) mm, camera frame; and, if
-        the row has one, `pose` (J, 3), which is None if nothing was found.
+        By variant, for each frame `head`; `depth` (H, W) float32 mm, 0 where unread; `camera`;
+        `edges`; `spine_mm`; `truth` (J, 3) mm, camera frame; and, if the row has one, `pose`
+        (J, 3), which is None if nothing was found.
     """
     found: dict[str, list[dict[str, Any]]] = {name: [] for name in rows}
     for place in places:
-        key = (place["split"], place["recording"], int(place["frame"]))
-        shown = _around(tests[key[0]][key[1]], key[2]) | {"head": key[0]}
+        key = split, k, frame = (place["split"], place["recording"], int(place["frame"]))
+        recording = tests[split][k]
+        shown = {
+            "head": split,
+            "depth": recording.depths(frame, frame + 1)[0],
+            "camera": recording.camera,
+            "edges": recording.skeleton.edges,
+            "spine_mm": recording.spine_mm,
+            "truth": recording.joints_camera[frame],
+        }
         for name, poses in rows.items():
             found[name].append(dict(shown))
             for one in poses:
@@ -365,31 +373,6 @@ def shown_poses(
                     joints = one["joints_mm"]
                     found[name][-1]["pose"] = None if joints is None else np.array(joints)
     return found
-
-
-def _around(recording: TrueRecording, frame: int) -> dict[str, Any]:
-    """The truth of a frame, with the part of its depth image around it and that part's camera."""
-    camera, truth = recording.camera, recording.joints_camera[frame]
-    true_px = camera.project(truth)
-    reach = 0.5 * np.ptp(true_px, axis=0).max()
-    half = int(np.ceil(max((1.0 + 2.0 * _MARGIN) * reach, 12)))
-    low = np.floor(0.5 * (true_px.min(axis=0) + true_px.max(axis=0))).astype(int) - half
-    side = 2 * half + 1
-    whole = recording.depths(frame, frame + 1)[0]
-    rows, columns = (np.arange(start, start + side) for start in (low[1], low[0]))
-    depth = np.zeros((side, side), np.float32)
-    in_rows, in_columns = (
-        (at >= 0) & (at < n) for at, n in zip((rows, columns), whole.shape, strict=True)
-    )
-    depth[np.ix_(in_rows, in_columns)] = whole[np.ix_(rows[in_rows], columns[in_columns])]
-    shift: dict[str, Any] = {"cx": camera.cx - float(low[0]), "cy": camera.cy - float(low[1])}
-    return {
-        "depth": depth,
-        "camera": replace(camera, **shift, width=side, height=side),
-        "edges": recording.skeleton.edges,
-        "spine_mm": recording.spine_mm,
-        "truth": truth,
-    }
 
 
 # Data of Figures 7, 13 to 16 and 19 of Lie-X: sensitivity, ranked candidates, key frames.

@@ -137,8 +137,8 @@ def test_what_is_lost_in_a_rendered_recording_counts_as_lost(monkeypatch):
 
     monkeypatch.setattr(SyntheticSession, "depths", without_frame_4)
     sessions = world_of(Skeleton.load("mouse")).test_split("clean", n_sessions=1)
-    toys = {"": toy_estimator("mouse", "default")}
-    errors = pose.errors_of(toys, sessions, Plan.load("mouse"), silent)[""]
+    toy = toy_estimator("mouse", "default")
+    errors = pose.errors_of(toy, sessions, Plan.load("mouse"), silent)
     assert np.flatnonzero(np.isnan(errors.error_mm)).tolist() == [4]
     assert errors.summary()["lost_rate"] == pytest.approx(0.1)
 
