@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 CONFTEST = Path(__file__).parent / "conftest.py"
 TESTS = """
 import pytest
@@ -18,6 +20,7 @@ def test_known_to_fail(): assert False
 """
 
 
+@pytest.mark.nightly
 def test_a_skip_fails_in_ci_unless_the_reference_data_are_absent(tmp_path: Path) -> None:
     inner = tmp_path / "repository" / "tests"
     inner.mkdir(parents=True)

@@ -59,14 +59,14 @@ def own(walker: Session, tmp_path: Path) -> Session:
 
 @pytest.fixture(scope="session")
 def study(walker: Session, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A study of two dozen copies, which nobody may change."""
-    return copies.study(walker, tmp_path_factory.mktemp("study"), 24)
+    """A study of a dozen copies, which nobody may change."""
+    return copies.study(walker, tmp_path_factory.mktemp("study"), 12)
 
 
 @pytest.fixture(scope="session")
 def served(walker: Session, tmp_path_factory: pytest.TempPathFactory) -> Served:
     """A dashboard of such a study, whose sessions may be corrected and reviewed."""
-    return Served(copies.study(walker, tmp_path_factory.mktemp("served"), 24))
+    return Served(copies.study(walker, tmp_path_factory.mktemp("served"), 12))
 
 
 @dataclass

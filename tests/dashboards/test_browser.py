@@ -4,14 +4,10 @@ nothing goes wrong.
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from liex_lab.dashboards.report.report import render
 
-from liex_lab.scene.scene import Arena
-from liex_lab.scene.zones import Zone
+from liex_lab.sessions import Session
 from tests.dashboards.conftest import Watched
-from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 _EMPTY = (
     "[...document.querySelectorAll('svg')].filter(svg => svg.getBoundingClientRect().height < "
@@ -30,17 +26,9 @@ _CUT = """high => [...document.querySelectorAll('svg, .cards, .problems')]
     .map(box => box.outerHTML.slice(0, 80))"""
 
 
-@pytest.fixture(scope="module")
-def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("browser")
-    mouse = WalkingMouse(np.delete(steady(14.0), slice(40, 46)), rear_s=(2.0, 3.0), lost=(60, 61))
-    nest = Zone(
-        "a nest with a rather long name", polygon_mm=((0.0, 0.0), (90.0, 0.0), (90.0, 90.0))
-    )
-    bowl = Arena("round", (0.0, 0.0), 220.0)
-    page = render(write(folder / "c.liex", mouse, arena=bowl, zones=(nest,)))
-    (folder / "report.html").write_text(page, encoding="utf-8")
-    return folder / "report.html"
+@pytest.fixture
+def report(walker: Session) -> Path:
+    return walker.path / "report.html"
 
 
 @pytest.mark.parametrize("width", [360, pytest.param(1000, marks=pytest.mark.nightly)])

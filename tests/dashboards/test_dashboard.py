@@ -56,8 +56,8 @@ def data(study: Path) -> StudyData:
 
 def test_every_session_of_the_study_is_listed_with_its_state_and_quality(data: StudyData) -> None:
     table = data.overview().set_index("session")
-    assert len(table) == 24
-    assert table["state"].value_counts().to_dict() == {"done": 22, "failed": 1, "new": 1}
+    assert len(table) == 12
+    assert table["state"].value_counts().to_dict() == {"done": 10, "failed": 1, "new": 1}
     failed = table[table["state"] == "failed"].iloc[0]
     assert (failed["reason"], failed["remedy"]) == ("frame 33 cannot be read", "copy it again")
     done = table.loc[KEY]
@@ -192,7 +192,7 @@ def test_the_groups_are_compared_as_liex_compare_does(data: StudyData) -> None:
     stats = data.stats("mean_speed_mm_s").set_index("measure")
     row = stats.loc["mean_speed_mm_s"]
     assert abs(row["estimate"]) == pytest.approx(40.0, abs=15.0)
-    assert (row["n_animals"], row["n_sessions"]) == (12, 22)
+    assert (row["n_animals"], row["n_sessions"]) == (6, 10)
     assert "measure" in tables.STATS
     assert (
         len(stats) > 3

@@ -15,7 +15,7 @@ from tests.dashboards import copies
 from tests.dashboards.conftest import Watched, fits_a_phone, until
 from tests.dashboards.served import Served
 
-N_SESSIONS = 24
+N_SESSIONS = 12
 KEY = "sub-m003_ses-01"
 
 

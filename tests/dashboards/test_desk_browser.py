@@ -110,13 +110,13 @@ def test_a_joint_is_dragged_and_its_frame_follows(served: Served, watched: Watch
     page.keyboard.press("u")
     expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
     watched.nothing_went_wrong()
-    dragged_off_the_animal(served, page)
-    page.keyboard.press("r")
-    expect(page.locator(".desk-said")).to_contain_text("nothing was taken back since the last")
 
 
-def dragged_off_the_animal(served: Served, page: Page) -> None:
-    """The height is kept, and the page shows it; what was taken back is made again."""
+@pytest.mark.nightly
+def test_a_joint_dragged_off_the_animal_keeps_its_height_and_can_be_redone(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
     row, said = 75, page.locator(".desk-said")
     stage = opened(served, page, float(MOUSE.times_s[row]))
     nose = session(served).poses.iloc[5 * row + 4]
@@ -140,6 +140,8 @@ def dragged_off_the_animal(served: Served, page: Page) -> None:
     expect(page.locator("#correct-made")).to_contain_text("Redo: nose of frame")
     page.keyboard.press("r")
     expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
+    page.keyboard.press("r")
+    expect(said).to_contain_text("nothing was taken back since the last")
 
 
 def bands_and_doubts_are_above_the_fold(page: Page) -> None:
@@ -179,6 +181,7 @@ def keys_belong_to_a_field(page: Page) -> None:
     page.get_by_text("Correct by a sentence").click()
 
 
+@pytest.mark.nightly
 def test_an_action_is_named_by_a_key_and_taken_back_by_another(
     served: Served, watched: Watched
 ) -> None:

@@ -5,6 +5,7 @@ the agreement at the end.
 import json
 from pathlib import Path
 
+import pytest
 from playwright.sync_api import Page, expect
 
 from tests.dashboards.conftest import Watched
@@ -82,6 +83,7 @@ def _of_clips(address: str) -> bool:
     return "/clip/" in address and not address.split("?")[0].endswith((".png", "/times"))
 
 
+@pytest.mark.nightly
 def test_what_cannot_be_reviewed_is_a_sentence(served: Served, watched: Watched) -> None:
     page = watched.page
     page.goto(f"{served.address}/review")

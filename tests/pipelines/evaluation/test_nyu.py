@@ -4,10 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from liex_lab.dashboards.paper.figures import draw_poses
 from liex_lab.pipelines.evaluation import nyu
 
 from liex_lab.recordings.formats.images.nyu import PALM, POINTS, NyuReference
@@ -95,9 +93,7 @@ def test_what_comes_from_test_labels_stands_beside_every_score(folder: Path) -> 
     assert same["root_given_mm_14"] == pytest.approx(7.8645, abs=5e-4)
 
 
-def test_ten_hands_are_shown_with_the_answers_of_all_and_ours_where_it_was_measured(
-    tmp_path: Path,
-) -> None:
+def test_ten_hands_are_shown_with_the_answers_of_all_and_ours_where_it_was_measured() -> None:
     truth = random_hands(95)
     answers = {"v2v_posenet": truth + np.array([3.0, 0.0, 4.0]), "somebody": truth + 9.0}
     ours = np.stack([truth[0] + 1.0, np.full((14, 3), np.nan)])
@@ -110,8 +106,5 @@ def test_ten_hands_are_shown_with_the_answers_of_all_and_ours_where_it_was_measu
             np.testing.assert_array_equal(one["truth"], truth[k - 1])
     assert ["pose" in one for one in shown["liex_lab"]] == [True] + 9 * [False]
     assert all("pose" in one for one in shown["somebody"])
-    figure = cv2.imread(str(draw_poses("NYU", shown, tmp_path / "hands.png")))
-    assert figure is not None
-    assert figure.std() > 10
     labels = nyu.shown_hands(NyuReference(truth[:3], {}), np.zeros(0, int), ours[:0])["labels"]
     assert [one["head"] for one in labels] == ["frame 1", "frame 2", "frame 3"]

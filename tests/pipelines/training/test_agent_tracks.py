@@ -42,6 +42,7 @@ def test_a_cut_out_action_is_tracked_with_what_lies_around_it(cut: AgentTrack) -
     assert track_error_mm([one]) < 3.0
 
 
+@pytest.mark.nightly
 def test_only_the_beginning_is_filmed_and_a_slower_camera_has_fewer_frames(
     recording: AgentTrack,
 ) -> None:

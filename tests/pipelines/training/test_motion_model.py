@@ -182,12 +182,6 @@ def test_the_table_of_rendered_sequences_is_the_same_on_one_thread_and_on_two(tm
     assert one == two
 
 
-def test_sequences_are_measured_in_the_arena_that_is_estimated():
-    one = motion_model.measure("mouse", "easy", 31, 16)
-    track = tracked(one, TrackingParameters.of("mouse"))
-    assert np.nanmedian(np.linalg.norm(track.joints_mm - one.truth, axis=-1)) < 8.0
-
-
 def test_roots_and_bends_are_covered_as_well(measured):
     tuning = calibrate_roots(measured, TrackingParameters.of("mouse"))
     turned, placed, bent = [], [], []

@@ -72,8 +72,6 @@ def test_a_model_is_trained_and_runs_with_the_plan_of_the_tutorial(
     assert made.card["recipe"]["n_images"] == 256
     assert made.method.reach_mm == pytest.approx(22.0 * 240.0 / 52.834, rel=1e-5)
     assert made.calibration.area_mm2 == pytest.approx(4000.0, rel=0.3)
-    again = pose_model.train_model(SNAKE, "default", tmp_path / "again.npz", n_images=256)
-    assert again.read_bytes() == model.read_bytes()
     session, off = run(model, tmp_path, 20)
     assert session.metadata["animal"]["name"] == "snake"
     assert np.isfinite(off).any()
