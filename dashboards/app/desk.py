@@ -215,8 +215,7 @@ class Desks:
             SessionError: there is no such session.
         """
         session = self._find(key)
-        make = partial(Desk, session, self._images, self._suggest)
-        return self._kept.get(key, id(session), make)
+        return self._kept.get(key, id(session), partial(Desk, session, self._images, self._suggest))
 
 
 def coloured_actions(words: Sequence[str]) -> list[dict[str, str]]:
@@ -282,8 +281,9 @@ def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretc
         centres = read_centres(session)
         if centres is not None:
             away_mm = np.linalg.norm(centres[:, 1] - centres[:, 0], axis=1)
-            followed = "perhaps the other is followed"
-            found += _meetings(animals[0], away_mm, spine_mm, "two animals", followed)
+            found += _meetings(
+                animals[0], away_mm, spine_mm, "two animals", "perhaps the other is followed"
+            )
         found += _found_again(animals[0])
     return sorted(found, key=lambda one: (one["start_s"], one["stop_s"]))
 

@@ -208,8 +208,9 @@ class Pages:
     def step(self, key: str) -> Response:
         """The time of the next or previous (?to=) frame, bout or flag (?by=) from ?t= (s)."""
         to = 1 if request.args.get("to") == "1" else -1
-        at_s = moved_to(self.data.session(key), _moment(), request.args.get("by", ""), to)
-        return jsonify(round(at_s, 4))
+        return jsonify(
+            round(moved_to(self.data.session(key), _moment(), request.args.get("by", ""), to), 4)
+        )
 
     def replay(self, key: str) -> Any:
         """Open the replay of a session at a moment."""
@@ -317,8 +318,9 @@ def _bars(
         word = named[codes[a]] if b > a else ""
         at = (start_s + a * (stop_s - start_s) / n) / unit[1]
         label = f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}"
-        part = {"at": 100.0 * a / n, "width": 100.0 * (b - a) / n, "word": word, "said": label}
-        bars.append(part)
+        bars.append(
+            {"at": 100.0 * a / n, "width": 100.0 * (b - a) / n, "word": word, "said": label}
+        )
     return bars
 
 
@@ -406,8 +408,12 @@ def _verdict(row: dict[str, Any], unit: str) -> dict[str, Any]:
         f"{row['n_without_value']} sessions without a value."
     )
     result = cohort.result(row, unit)
-    tested = bool(row["test"])
-    return {"contrast": row["contrast"], "result": result, "counts": counts, "tested": tested}
+    return {
+        "contrast": row["contrast"],
+        "result": result,
+        "counts": counts,
+        "tested": bool(row["test"]),
+    }
 
 
 def session_facts(data: StudyData, key: str) -> dict[str, Any]:
@@ -452,8 +458,7 @@ def moved_to(session: Session, at_s: float, by: str, to: int) -> float:
     """
     time_s = session.frames["time_s"].to_numpy(float)
     if by == "frame":
-        row = np.abs(time_s - at_s).argmin() + to
-        return float(time_s[np.clip(row, 0, len(time_s) - 1)])
+        return float(time_s[np.clip(np.abs(time_s - at_s).argmin() + to, 0, len(time_s) - 1)])
     places = (
         session.bouts["start_s"].to_numpy(float)
         if by == "bout"

@@ -317,8 +317,7 @@ class Downloads:
 
     def table(self, name: str) -> Response:
         """A table as shown, by its `name`, see `tables.find`."""
-        file = name.replace("/", "_").strip("_")
-        return _csv(lambda: tables.find(self._data, name).rows, file)
+        return _csv(lambda: tables.find(self._data, name).rows, name.replace("/", "_").strip("_"))
 
     def session_table(self, key: str, name: str) -> Response:
         """The whole table `name` of the session `key`."""

@@ -129,8 +129,7 @@ class SessionAnimal:
 
     def broken(self, values: pd.Series[float]) -> Array:
         """Values of every frame, with NaN for the first one after a gap of the camera."""
-        whole = self.frames["gap_before"].to_numpy() == 0
-        return np.where(whole, values.to_numpy(float), np.nan)
+        return np.where(self.frames["gap_before"].to_numpy() == 0, values.to_numpy(float), np.nan)
 
     def rows_of(self, table: pd.DataFrame) -> pd.DataFrame:
         """The rows of a table that are of this animal."""
@@ -241,8 +240,9 @@ class DepthImages:
         with self._lock:
             try:
                 file = (session.path / "session.mcap").stat()
-                stamp = (file.st_mtime_ns, file.st_size, file.st_ino)
-                recording = self._open.get(session.path, stamp, opened)[1]
+                recording = self._open.get(
+                    session.path, (file.st_mtime_ns, file.st_size, file.st_ino), opened
+                )[1]
                 return np.asarray(recording.frame(row).depth, np.uint16)
             except (LiexError, OSError, IndexError):
                 return _thumbnail(session, row)
@@ -280,8 +280,7 @@ def read_cutout(
     cut = cv2.imread(str(session.path / entry["file"]), cv2.IMREAD_UNCHANGED)
     if cut is None:
         return None, None
-    shape = (session.camera.height, session.camera.width)
-    whole = np.zeros(shape, np.uint16)
+    whole = np.zeros((session.camera.height, session.camera.width), np.uint16)
     paste(whole, np.asarray(cut, np.uint16), int(entry["left_px"]), int(entry["top_px"]))
     return np.asarray(cut, np.uint16), whole
 

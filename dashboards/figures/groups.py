@@ -258,8 +258,7 @@ def comparison(
     figure.text(
         2.0 / TWO_COLUMNS_MM, 2.0 / edge, "\n".join(lines), size=5.5, color=MUTED, va="bottom"
     )
-    right = panel(figure, 122.0, bottom, 36.0, height)
-    _differences(right, own, factor, read)
+    _differences(panel(figure, 122.0, bottom, 36.0, height), own, factor, read)
     return figure
 
 
@@ -288,8 +287,9 @@ def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
         size=5.5,
     )
     heading(figure, f"Effect sizes, n = {counted(len(known), 'comparison')}")
-    label = "Hedges' g with its 95 % interval; hollow: no test"
-    axes.set(ylim=(len(known) - 0.5, -0.5), xlabel=label)
+    axes.set(
+        ylim=(len(known) - 0.5, -0.5), xlabel="Hedges' g with its 95 % interval; hollow: no test"
+    )
     return figure
 
 
@@ -310,8 +310,9 @@ def _strip(
     large = axes.scatter(k + beside, means, 20.0, colour, marker=mark, gid=gid, zorder=3)
     small = None
     if len(values) > len(names_of):  # else the sessions are the animals
-        at = k + beside[animal] + 0.03
-        small = axes.scatter(at, values, 4.0, colour, marker=mark, alpha=0.5, zorder=2)
+        small = axes.scatter(
+            k + beside[animal] + 0.03, values, 4.0, colour, marker=mark, alpha=0.5, zorder=2
+        )
     if link is not None:
         keys = rows["key"].astype(str)
         sizes = [counted(int(n), "session") for n in np.bincount(animal)]

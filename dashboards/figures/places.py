@@ -95,8 +95,9 @@ def draw_outlines(axes: Axes, session: Session, named: bool = True, centred: boo
 
 
 def _outline(axes: Axes, corners: Array, gid: str, dashed: Any) -> None:
-    closed = np.vstack([corners, corners[:1]])
-    axes.plot(*closed.T, color=MUTED, linewidth=0.7, linestyle=dashed, gid=gid)
+    axes.plot(
+        *np.vstack([corners, corners[:1]]).T, color=MUTED, linewidth=0.7, linestyle=dashed, gid=gid
+    )
 
 
 def draw_region(axes: Axes, session: Session) -> None:
@@ -202,8 +203,9 @@ def trajectory(animal: SessionAnimal) -> Figure | None:
         f"{animal.hold_s[known].sum():.1f} s observed",
     )
     unit, size = time_unit(animal.duration_s)
-    clock = Normalize(0.0, max(animal.duration_s, 1e-9) / size)
-    colours = ScalarMappable(clock, colormaps["viridis"].with_extremes())
+    colours = ScalarMappable(
+        Normalize(0.0, max(animal.duration_s, 1e-9) / size), colormaps["viridis"].with_extremes()
+    )
     path = np.column_stack([animal.column("x_mm"), animal.column("y_mm")])
     time_s = animal.frames["time_s"].to_numpy(float)
     # at most five points per second of an hour
@@ -220,8 +222,7 @@ def trajectory(animal: SessionAnimal) -> Figure | None:
         axes.plot(*animal.xy_mm[row], "o", color=colour, markersize=3.5, markeredgecolor=PAPER)
         x, y = animal.xy_mm[row]
         halo(axes.annotate(word, (x, y), (3, 3), textcoords="offset points", size=6.0))
-    corners = extent_mm(animal.session, animal.xy_mm)
-    return _finished(figure, colours, f"time, {unit}", *corners)
+    return _finished(figure, colours, f"time, {unit}", *extent_mm(animal.session, animal.xy_mm))
 
 
 def arena_heights(
@@ -294,8 +295,9 @@ def arena_map(session: Session, depth: Sequence[NDArray[np.uint16]]) -> Figure |
         place = fixture.centre_mm
         axes.plot(*place, "+", color=PAPER, markersize=4)
         halo(axes.annotate(str(fixture), place, (3, 2), textcoords="offset points", size=6.0))
-    corners = np.array([[x_mm[0], y_mm[0]], [x_mm[-1], y_mm[-1]]])
-    return _finished(figure, image, "height, mm", *corners)
+    return _finished(
+        figure, image, "height, mm", *np.array([[x_mm[0], y_mm[0]], [x_mm[-1], y_mm[-1]]])
+    )
 
 
 def occupancy_panels(title: str, panels: Sequence[tuple[str, Session, Occupancy]]) -> Figure | None:
@@ -348,6 +350,5 @@ def _finished(figure: Figure, image: Any, label: str, low_mm: Array, high_mm: Ar
 def _colour_bar(figure: Figure, image: Any, label: str) -> None:
     across, up = figure.get_size_inches() * 25.4
     axes = panel(figure, across - 14.0, 0.25 * up, 2.5, 0.45 * up)
-    bar = figure.colorbar(image, cax=axes)
-    bar.outline.set_visible(False)
+    figure.colorbar(image, cax=axes).outline.set_visible(False)
     axes.set_title(label, size=6.0, color=INK)

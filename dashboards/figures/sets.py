@@ -100,8 +100,12 @@ def comparison_figures(
         sessions: the opened sessions; () omits the figures that need them.
         only: names of `OF_STUDY`, 'effects', or measures of `stats`; () draws all.
     """
-    none = pd.DataFrame(columns=["table", "name", "unit"])
-    columns = pd.concat([none, *(session.columns for session in sessions)])
+    columns = pd.concat(
+        [
+            pd.DataFrame(columns=["table", "name", "unit"]),
+            *(session.columns for session in sessions),
+        ]
+    )
     known = columns[columns["table"] == "summary"].drop_duplicates("name")
     units = dict(zip(known["name"].astype(str), known["unit"].fillna("").astype(str), strict=True))
     accounted = str(table.attrs.get("accounted", ""))

@@ -116,8 +116,7 @@ def panel(
         height_mm: its height, mm.
     """
     across, up = figure.get_size_inches() * 25.4
-    place = (left_mm / across, bottom_mm / up, width_mm / across, height_mm / up)
-    return figure.add_axes(place)
+    return figure.add_axes((left_mm / across, bottom_mm / up, width_mm / across, height_mm / up))
 
 
 def one_panel(
@@ -186,8 +185,9 @@ def time_unit(duration_s: float) -> tuple[str, float]:
 
 def halo(text: Any) -> None:
     """Put a box of paper behind a text, for legibility; an outline would turn it into shapes."""
-    behind = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "alpha": 0.75, "linewidth": 0.0}
-    text.set_bbox(behind)
+    text.set_bbox(
+        {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "alpha": 0.75, "linewidth": 0.0}
+    )
 
 
 def key_rows(words: Sequence[str]) -> int:

@@ -76,8 +76,15 @@ def ethogram(animal: SessionAnimal, span_s: Span | None = None) -> Figure | None
     hair_s = 0.05 * (last_s - first_s) / width
 
     def draw(spans: Array, row: tuple[float, float], gid: str, colour: str = "") -> None:
-        near = spans[(spans[:, 1] >= first_s) & (spans[:, 0] <= last_s)]
-        draw_spans(axes, near, row, size, hair_s, colour, gid=gid)
+        draw_spans(
+            axes,
+            spans[(spans[:, 1] >= first_s) & (spans[:, 0] <= last_s)],
+            row,
+            size,
+            hair_s,
+            colour,
+            gid=gid,
+        )
 
     draw(animal.lost_s, (-0.5, max(len(words), 1)), "no pose")
     for k, (word, colour) in enumerate(action_colours(words).items()):
@@ -122,8 +129,13 @@ def curves(
         if " height above the floor" in title and len(rears):
             title += "; rearing shaded"
             for a, b, word in rears:
-                shade = colours.get(str(word), MUTED)
-                axes.axvspan(a / size, b / size, color=shade, alpha=0.3, linewidth=0.0)
+                axes.axvspan(
+                    a / size,
+                    b / size,
+                    color=colours.get(str(word), MUTED),
+                    alpha=0.3,
+                    linewidth=0.0,
+                )
         axes.set_title(
             f"{title}, {animal.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
@@ -163,8 +175,7 @@ def walked(animal: SessionAnimal) -> tuple[Array, Array, int]:
     assert animal.kinematics is not None
     step = animal.kinematics["step_mm"].to_numpy(float)
     n = int(np.isfinite(step).sum())
-    time_s = animal.kinematics["time_s"].to_numpy(float)
-    return time_s, np.cumsum(np.nan_to_num(step)) / 1000.0, n
+    return animal.kinematics["time_s"].to_numpy(float), np.cumsum(np.nan_to_num(step)) / 1000.0, n
 
 
 def speed_distribution(animal: SessionAnimal) -> Figure | None:
@@ -299,8 +310,9 @@ def time_budget(animal: SessionAnimal) -> Figure | None:
             color=MUTED,
         )
     name_rows(axes, [word.replace("_", " ") for word in words])
-    most = max(1.05 * float(shares.max()), 1.0)
-    axes.set(xlim=(0.0, most), xlabel="share of the observed time, %")
+    axes.set(
+        xlim=(0.0, max(1.05 * float(shares.max()), 1.0)), xlabel="share of the observed time, %"
+    )
     return figure
 
 
@@ -509,6 +521,7 @@ def _onsets(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
                     shown(some, curve.unit)[0] for some in (one.low, one.median, one.high)
                 )
                 unit = shown(1.0, curve.unit)[1]
-                around = Around(one.time_s, low, median, high, one.n)
-                found.append((curve.title, unit, word, around))
+                found.append(
+                    (curve.title, unit, word, Around(one.time_s, low, median, high, one.n))
+                )
     return found

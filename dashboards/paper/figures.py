@@ -99,8 +99,9 @@ def _sheet(
     n_rows: int, n_columns: int, width: float, height: float, margin: tuple[float, float] = (0, 0)
 ) -> tuple[Figure, list[list[Axes]]]:
     """A figure with a grid of panels of `width` x `height` inches, and a margin around them."""
-    size = (width * n_columns + margin[0], height * n_rows + margin[1])
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(
+        figsize=(width * n_columns + margin[0], height * n_rows + margin[1]), layout="constrained"
+    )
     return figure, figure.subplots(n_rows, n_columns, squeeze=False).tolist()
 
 
@@ -114,8 +115,13 @@ def _bones(
     panel: Axes, points: Array, edges: Edges, colour: str, width: float, dot: int | None = 0
 ) -> None:
     """A skeleton of points (J, 2), with a dot on one joint."""
-    ends = np.moveaxis(points[np.array(edges).T], -1, 0)
-    panel.plot(*ends, "-", color=colour, lw=width, solid_capstyle="round")
+    panel.plot(
+        *np.moveaxis(points[np.array(edges).T], -1, 0),
+        "-",
+        color=colour,
+        lw=width,
+        solid_capstyle="round",
+    )
     if dot is not None:
         panel.plot(*points[dot], "o", color=colour, ms=2.5 * width)
 
@@ -247,8 +253,9 @@ def _pose(panel: Axes, one: Mapping[str, Any], side: bool) -> None:
         panel.set_facecolor("#dfe3e6")
         flat = camera.project
         ends_px = [flat(truth).min(axis=0), flat(truth).max(axis=0)]
-        reach_px = max(0.85 * float(np.ptp(ends_px, axis=0).max()), 12.0)
-        _around(panel, np.mean(ends_px, axis=0), reach_px)
+        _around(
+            panel, np.mean(ends_px, axis=0), max(0.85 * float(np.ptp(ends_px, axis=0).max()), 12.0)
+        )
     else:
         plane = [0, 2] if side else [0, 1]
         half = (0.75 if side else 0.65) * max(float((high - low)[: 3 if side else 2].max()), 1.0)
@@ -383,8 +390,13 @@ def _moment(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed], f
     """The depth around the animal with the true and the estimated skeletons."""
     spine, camera = sequence.spine_mm, sequence.camera
     middle = sequence.joints_camera[frame].mean(axis=0)
-    depth = sequence.depths(frame, frame + 1)[0]
-    _depth(panel, depth, middle[2] - 0.6 * spine, middle[2] + 0.6 * spine, "Greys")
+    _depth(
+        panel,
+        sequence.depths(frame, frame + 1)[0],
+        middle[2] - 0.6 * spine,
+        middle[2] + 0.6 * spine,
+        "Greys",
+    )
     _around(panel, camera.project(middle), 0.9 * spine * camera.fx / middle[2])
     skeletons = {_GREEN: sequence.joints_arena} | {
         _TRACKERS[name][1]: rows[name].joints for name in ("single", "smoothed")
@@ -413,8 +425,14 @@ def draw_key_frames(acts: Sequence[Mapping[str, Any]], path: Path) -> Path:
         panel.plot(*np.concatenate(bodies).T, ".", color="#b9bfc5", ms=1.6, alpha=0.6)
         for joints in skeletons:
             _bones(panel, joints, act["edges"], "#3a4046", 0.9, None)
-        order = np.linspace(0, 1, len(along))
-        panel.scatter(along[:, 0], along[:, 1], c=order, cmap="coolwarm", s=9, zorder=3)
+        panel.scatter(
+            along[:, 0],
+            along[:, 1],
+            c=np.linspace(0, 1, len(along)),
+            cmap="coolwarm",
+            s=9,
+            zorder=3,
+        )
         everything = np.concatenate([along, *bodies, *skeletons])
         low, high = everything.min(axis=0), everything.max(axis=0)
         half = 0.5 * float((high - low).max()) + 8.0  # square, in any direction

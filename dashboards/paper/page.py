@@ -184,8 +184,14 @@ def error_table(results: Results) -> Table:
     for variant, title in TITLES.items():
         row = results["rows"].get(variant)
         medians = {heads[s]: _median(row["splits"][s]) if row else "" for s in heads}
-        mean = _number(published.get(variant))
-        rows.append({"method": title, **medians, theirs: mean, "row": _origin(row)})
+        rows.append(
+            {
+                "method": title,
+                **medians,
+                theirs: _number(published.get(variant)),
+                "row": _origin(row),
+            }
+        )
     if results["animal"] == "hand":
         rows += [
             {"method": title, theirs: _number(value), "row": "published"}

@@ -40,8 +40,9 @@ def live_blueprint(body_m: float) -> Any:
         name="depth with the skeleton",
     )
     error = rrb.TimeSeriesView(origin=ERROR, name="predicted error (mm)")
-    scene = _scene(body_m, SKELETON)
-    return _blueprint(rrb.Vertical(rrb.Horizontal(scene, image), error, row_shares=[4, 1]))
+    return _blueprint(
+        rrb.Vertical(rrb.Horizontal(_scene(body_m, SKELETON), image), error, row_shares=[4, 1])
+    )
 
 
 def replay_blueprint(session: dict[str, Any]) -> Any:
@@ -85,8 +86,9 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
             name="the animal, zoomed",
         )
         image = rrb.Vertical(zoomed, image)
-    above = rrb.Horizontal(scene, image)
-    return _blueprint(rrb.Vertical(above, *_over_time(at, animal), row_shares=[5, 1.6, 2]))
+    return _blueprint(
+        rrb.Vertical(rrb.Horizontal(scene, image), *_over_time(at, animal), row_shares=[5, 1.6, 2])
+    )
 
 
 def _blueprint(views: Any) -> Any:
@@ -169,8 +171,10 @@ def foxglove_layout(about: dict[str, Any]) -> dict[str, Any]:
     layout: dict[str, Any] = json.loads(_EMPTY_LAYOUT.read_text(encoding="utf-8"))
     panels = layout["configById"]
     far_mm = float(about["camera"]["floor_distance_mm"])
-    depth_mm = {"minValue": round(0.85 * far_mm), "maxValue": round(1.02 * far_mm)}
-    panels["Image!depth"]["imageMode"] |= depth_mm
+    panels["Image!depth"]["imageMode"] |= {
+        "minValue": round(0.85 * far_mm),
+        "maxValue": round(1.02 * far_mm),
+    }
     joints = list(about["animal"]["joints"])
     ends = sorted({0, len(joints) - 1} if about["animal"]["name"] != "hand" else {0})
     panels["Plot!heights"]["paths"] = [

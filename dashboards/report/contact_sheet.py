@@ -55,8 +55,13 @@ def scene_marks(session: Session) -> list[Mark]:
     outline = Mark("outline", in_image(session, session.arena.outline_mm()))
     made = [mark for mark in (region, outline) if len(mark.points_px) >= 3]
     for fixture in map(Fixture.from_dict, scene.get("fixtures") or []):
-        centre = in_image(session, np.array([fixture.centre_mm]), fixture.height_mm)
-        made.append(Mark("fixture", centre, str(fixture)))
+        made.append(
+            Mark(
+                "fixture",
+                in_image(session, np.array([fixture.centre_mm]), fixture.height_mm),
+                str(fixture),
+            )
+        )
     hidden = hidden_places(session)
     # the 24 longest ones
     longest = np.argsort(hidden[:, 2] - hidden[:, 3], kind="stable")[:24]
@@ -161,8 +166,10 @@ def image_svg(
     r = float(np.clip(0.4 * bone_px, w / 200.0, usual)) if unit is None else unit
     # 320 px per side is twice the widest display
     share = min(320 / max(h, w), 1.0)
-    size = (round(share * w), round(share * h))
-    small = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    small = np.asarray(
+        cv2.resize(rgb, (round(share * w), round(share * h)), interpolation=cv2.INTER_AREA),
+        np.uint8,
+    )
     parts = [f'<image href="{png_uri(small)}" width="{w}" height="{h}"/>']
     parts.append(svg_marks(marks, left, top, w, h, 0.9 * (unit or usual), lettered))
     for colour, width in (("#222", 1.3 * r), ("#fff", 0.8 * r)):  # for light and dark surfaces
@@ -239,10 +246,11 @@ def whole_image(session: Session) -> tuple[str, str] | None:
     entry = session.metadata.get("whole_picture")
     if not entry:
         return None
-    beside = Mark("beside", np.array([entry["beside_px"]], float), "not measured")
-    marks = [*scene_marks(session), beside]
-    unit = session.camera.width / 250.0
-    drawn = _drawn(session, [entry], marks, unit=unit, lettered=True)
+    marks = [
+        *scene_marks(session),
+        Mark("beside", np.array([entry["beside_px"]], float), "not measured"),
+    ]
+    drawn = _drawn(session, [entry], marks, unit=session.camera.width / 250.0, lettered=True)
     return next(((svg, f"{time_s:.2f} s") for svg, time_s in drawn), None)
 
 

@@ -233,8 +233,13 @@ def write_views(folder: str | Path) -> Path:
 def write_report(folder: str | Path) -> Path:
     """Write report.html and the figure files of a session folder; returns the report's path."""
     path = Path(folder) / "report.html"
-    session = Session.open(folder).narrowed(frames=FRAMES, kinematics=KINEMATICS)
-    write_whole(path, render(session, path.parent / FOLDER))
+    write_whole(
+        path,
+        render(
+            Session.open(folder).narrowed(frames=FRAMES, kinematics=KINEMATICS),
+            path.parent / FOLDER,
+        ),
+    )
     return path
 
 

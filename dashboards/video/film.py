@@ -88,8 +88,9 @@ class Relief:
         share = np.clip(255.0 / self.top_mm * smooth, 0.0, 255.0).astype(np.uint8)
         colours = cv2.LUT(cv2.merge([share] * 3), self._colours[None])
         slope_y, slope_x = np.gradient(np.asarray(even, np.float32), self.pixel_mm)
-        slope = 1.0 + 0.3 * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y)
-        light = (_PLAIN * np.clip(slope, 0.6, 1.4)).astype(np.uint8)
+        light = (
+            _PLAIN * np.clip(1.0 + 0.3 * (_LIGHT[0] * slope_x + _LIGHT[1] * slope_y), 0.6, 1.4)
+        ).astype(np.uint8)
         light = cv2.resize(light, size, interpolation=cv2.INTER_LINEAR)
         colours = cv2.multiply(colours, cv2.merge([light] * 3), scale=1.0 / _PLAIN)
         outside = _part(self._outside, left, top, side) > 0.5
@@ -103,8 +104,9 @@ class Relief:
 
     def scale(self, height: int) -> NDArray[np.uint8]:
         """The colours from 0 to `top_mm`, the highest on top: (height, 6, 3) uint8 RGB."""
-        at = np.linspace(255.0, 0.0, height).astype(np.uint8)
-        return np.repeat(self._colours[at][:, None], 6, axis=1)
+        return np.repeat(
+            self._colours[np.linspace(255.0, 0.0, height).astype(np.uint8)][:, None], 6, axis=1
+        )
 
 
 def scale_mm(sessions: Sequence[Session]) -> float:
@@ -143,8 +145,9 @@ def _beyond_walls(session: Session, rays: Array) -> NDArray[np.float32]:
 
 def _enlarged(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool_]:
     """A mask in another size, with smooth edges."""
-    large = cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR)
-    return np.asarray(large > 127)
+    return np.asarray(
+        cv2.resize(mask.astype(np.uint8) * 255, size, interpolation=cv2.INTER_LINEAR) > 127
+    )
 
 
 @lru_cache(maxsize=8)
@@ -227,8 +230,9 @@ def smooth_path(joints: Array, camera: Camera) -> tuple[Array, int]:
     known = np.isfinite(middle).all(axis=1)
     rows = np.arange(len(middle))
     if not known.any():
-        still = np.tile([camera.width / 2, camera.height / 2], (len(middle), 1))
-        return still, max(camera.height // 2, _LEAST_PX)
+        return np.tile([camera.width / 2, camera.height / 2], (len(middle), 1)), max(
+            camera.height // 2, _LEAST_PX
+        )
     whole = np.column_stack([np.interp(rows, rows[known], middle[known, axis]) for axis in (0, 1)])
     width = min(15, len(rows) | 1)
     padded = np.pad(whole, ((width // 2, width // 2), (0, 0)), mode="edge")
@@ -331,8 +335,9 @@ class Film(Footage):
         # a margin around the arena
         margin = 0.05 * float((high - low).max())
         x0, y0 = np.maximum(np.floor(low - margin), 0).astype(int).tolist()
-        most = [camera.width, camera.height]
-        x1, y1 = np.minimum(np.ceil(high + margin), most).astype(int).tolist()
+        x1, y1 = (
+            np.minimum(np.ceil(high + margin), [camera.width, camera.height]).astype(int).tolist()
+        )
         return View(x0, y0, max(x1 - x0, 2), max(y1 - y0, 2))
 
     def near_view(self, row: int, animal: int = 0) -> View:

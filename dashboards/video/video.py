@@ -82,8 +82,9 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8], 
             height, width = (n - n % 2 for n in image.shape[:2])
             if not stream.codec_context.is_open:  # at the first image
                 stream.height, stream.width = height, width
-            even = np.ascontiguousarray(image[:height, :width])
-            frame = av.VideoFrame.from_ndarray(even, format="rgb24")
+            frame = av.VideoFrame.from_ndarray(
+                np.ascontiguousarray(image[:height, :width]), format="rgb24"
+            )
             frame.time_base = _CLOCK
             frame.pts = round(time_s / _CLOCK)
             container.mux(stream.encode(frame))
@@ -213,8 +214,9 @@ def write_clips(
         top_mm = scale_mm([session for session, _ in sessions])
         blocks: dict[str, list[Cell]] = {}
         for session, group in sessions:
-            film = stack.enter_context(closing(Film(session, top_mm)))
-            blocks.setdefault(group, []).extend(_cells(film, actions))
+            blocks.setdefault(group, []).extend(
+                _cells(stack.enter_context(closing(Film(session, top_mm))), actions)
+            )
         if not any(blocks.values()):
             known = sorted({word for session, _ in sessions for word in session.bouts["action"]})
             raise SessionError(
@@ -235,8 +237,7 @@ def write_clips(
             count = f"n = {len(some)} of {total}" if len(some) < total else f"n = {total}"
             group = name or (NO_GROUP if len(chosen) > 1 else "")
             heads[name] = ", ".join(filter(None, (group, what, count)))
-        n = max(round(longest * fps * slower), 1)
-        after_s = np.arange(n) / (fps * slower)
+        after_s = np.arange(max(round(longest * fps * slower), 1)) / (fps * slower)
         _write(path, fps, after_s, slower, lambda t: _grid(chosen, heads, t), progress)
     return path
 
@@ -254,15 +255,17 @@ def _grid(
     columns = int(np.ceil(np.sqrt(n)))
     step = _CELL_PX + _GAP_PX
     block = columns * step + 4 * _GAP_PX
-    width = max(block * len(chosen), 2 * step)
-    out = np.full((_HEAD_PX + -(-n // columns) * step, width, 3), _PAPER, np.uint8)
+    out = np.full(
+        (_HEAD_PX + -(-n // columns) * step, max(block * len(chosen), 2 * step), 3),
+        _PAPER,
+        np.uint8,
+    )
     for b, (group, cells) in enumerate(chosen.items()):
         write(out, heads[group], b * block + 4, 5, 15)
         for k, cell in enumerate(cells):
             row, column = divmod(k, columns)
             x, y = b * block + column * step, _HEAD_PX + row * step
-            shown = cell.image(after_s, (_CELL_PX, _CELL_PX))
-            out[y : y + _CELL_PX, x : x + _CELL_PX] = shown
+            out[y : y + _CELL_PX, x : x + _CELL_PX] = cell.image(after_s, (_CELL_PX, _CELL_PX))
     return out
 
 
@@ -277,8 +280,15 @@ def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
             if matches(str(bout["action"]), actions):
                 # from half a second before a bout to half a second after it, but at most 6 s
                 start = max(float(bout["start_s"]) - 0.5, 0.0)
-                stop = min(float(bout["stop_s"]) + 0.5, end, start + 6.0)
-                found.append(Cell(film, start, stop, animal.who, k))
+                found.append(
+                    Cell(
+                        film,
+                        start,
+                        min(float(bout["stop_s"]) + 0.5, end, start + 6.0),
+                        animal.who,
+                        k,
+                    )
+                )
     return found
 
 

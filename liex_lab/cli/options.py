@@ -212,8 +212,10 @@ class SectionedGroup(TyperGroup):
         Args:
             ctx: click's context of the command line.
         """
-        names = super().list_commands(ctx)
-        return sorted(names, key=lambda name: _OF_WORK.index(name) if name in _OF_WORK else 99)
+        return sorted(
+            super().list_commands(ctx),
+            key=lambda name: _OF_WORK.index(name) if name in _OF_WORK else 99,
+        )
 
     # the types are click's, or those of the copy of click in newer Typers
     def format_commands(self, ctx: Any, formatter: Any) -> None:
@@ -232,8 +234,7 @@ class SectionedGroup(TyperGroup):
                 continue
             panel = getattr(command, "rich_help_panel", None)
             section = panel if isinstance(panel, str) else "Commands"
-            row = (name, command.get_short_help_str(2 * width))
-            sections.setdefault(section, []).append(row)
+            sections.setdefault(section, []).append((name, command.get_short_help_str(2 * width)))
         for section, rows in sections.items():
             if rows:
                 with formatter.section(section):

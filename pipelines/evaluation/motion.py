@@ -72,8 +72,9 @@ class PointMotion:
     @property
     def length_mm(self) -> float:
         """Median length along the points."""
-        bones = np.linalg.norm(np.diff(self.points_mm, axis=1), axis=-1)
-        return float(np.median(bones.sum(axis=1)))
+        return float(
+            np.median(np.linalg.norm(np.diff(self.points_mm, axis=1), axis=-1).sum(axis=1))
+        )
 
     def posture(self) -> dict[str, Array]:
         """Each of `POSTURE` in every frame (n,), degrees and with its sign; stretch a ratio."""
@@ -100,12 +101,15 @@ class PointMotion:
         rump, neck = self.points_mm[:, 0], self.points_mm[:, 3]
         trunk, middle = neck - rump, 0.5 * (neck + rump)
         step = np.linalg.norm((middle[lag:] - middle[:-lag])[:, :2], axis=-1)
-        turn = np.abs(_turn(trunk[:-lag], trunk[lag:]))
-        found = {"speed": step / self.length_mm * per_s, "turning": turn * per_s}
+        found = {
+            "speed": step / self.length_mm * per_s,
+            "turning": np.abs(_turn(trunk[:-lag], trunk[lag:])) * per_s,
+        }
         posture = self.posture()
         for name in ("trunk_bend", "head_turn", "head_pitch"):
-            off = (posture[name][lag:] - posture[name][:-lag] + 180.0) % 360.0 - 180.0
-            found[f"{name}_rate"] = np.abs(off) * per_s
+            found[f"{name}_rate"] = (
+                np.abs((posture[name][lag:] - posture[name][:-lag] + 180.0) % 360.0 - 180.0) * per_s
+            )
         return {name: values[together] for name, values in found.items()}
 
 
@@ -117,8 +121,9 @@ def _turn(first: Array, second: Array) -> Array:
 
 def _elevation(direction: Array) -> Array:
     """Elevations (n,) of directions (n, 3), degrees."""
-    level = np.hypot(direction[:, 0], direction[:, 1])
-    return np.asarray(np.degrees(np.arctan2(direction[:, 2], level)))
+    return np.asarray(
+        np.degrees(np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1])))
+    )
 
 
 def motion_figures(real: PointMotion, virtual: dict[str, PointMotion]) -> dict[str, Any]:
@@ -319,8 +324,9 @@ def _upright(points: Array, columns: list[int], up: str, path: Path) -> Array:
 
 def _shares(points_mm: Array) -> Array:
     """Positions (5,) of the points along an animal, from 0 at the tail's base to 1 at the nose."""
-    bones = np.median(np.linalg.norm(np.diff(points_mm, axis=1), axis=-1), axis=0)
-    reach = np.concatenate([[0.0], np.cumsum(bones)])
+    reach = np.concatenate(
+        [[0.0], np.cumsum(np.median(np.linalg.norm(np.diff(points_mm, axis=1), axis=-1), axis=0))]
+    )
     return np.asarray(reach / reach[-1])
 
 
@@ -333,8 +339,14 @@ def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) ->
         assert isinstance(recording, SyntheticSession)
         body = recording.contents
         assert isinstance(body.shape, BodyShape)
-        shapes = body.shape.broadcast(_PER_RECORDING)
-        points.append(on_back(skeleton, (body.pose, body.girth, shapes), along, above))
+        points.append(
+            on_back(
+                skeleton,
+                (body.pose, body.girth, body.shape.broadcast(_PER_RECORDING)),
+                along,
+                above,
+            )
+        )
     clips = np.repeat(np.arange(len(points)), _PER_RECORDING)
     return PointMotion(np.concatenate(points), clips, 1e9 / FRAME_NS)
 

@@ -129,8 +129,7 @@ def evaluate_nyu(
         draw_poses(title, shown_hands(labels, numbers, points), figure)
     published, same = {}, {}
     for name, answer in labels.answers.items():
-        errors = nyu_errors(answer, labels.truth)
-        published[name] = {"method": _PUBLISHED.get(name, name), **errors}
+        published[name] = {"method": _PUBLISHED.get(name, name), **nyu_errors(answer, labels.truth)}
         if len(numbers):
             same[name] = nyu_errors(answer[numbers - 1], labels.truth[numbers - 1])
     return {
@@ -158,8 +157,7 @@ def shown_hands(
         By method, for each hand its `head`, `truth` (14, 3) mm, and `pose` (14, 3) mm if the method
         has one; ours comes first if it found any of them.
     """
-    n = len(labels.truth)
-    rows = np.unique(np.arange(_SHOWN) * n // _SHOWN)
+    rows = np.unique(np.arange(_SHOWN) * len(labels.truth) // _SHOWN)
     own = np.full_like(labels.truth, np.nan)
     own[numbers - 1] = ours
     found: dict[str, list[dict[str, Any]]] = {}
@@ -230,8 +228,7 @@ def _ours(
         return {"n_frames": 0, "note": str(error)}, points
     skeleton = estimator.skeleton
     with build_recording(folder, plan) as recording:
-        n_sample = plan.foreground.n_background_frames
-        scene, sample = build_scene(recording, plan, skeleton, n_sample)
+        scene, sample = build_scene(recording, plan, skeleton, plan.foreground.n_background_frames)
         size = estimator.find_size(sample, scene)
         weights = points_of_joints(skeleton)
         # frames in memory at a time
@@ -240,6 +237,9 @@ def _ours(
             joints = estimator.estimate(depths, scene, size).chosen.pose.joints(skeleton)
             points[[frame.index for frame in frames]] = weights @ joints
             progress(frames[-1].index + 1, len(recording), "measuring hands")
-    errors = nyu_errors(points, truth[numbers - 1])
-    ours = {"method": "liex_lab, default", "spine_mm": size * skeleton.length, **errors}
+    ours = {
+        "method": "liex_lab, default",
+        "spine_mm": size * skeleton.length,
+        **nyu_errors(points, truth[numbers - 1]),
+    }
     return ours, points

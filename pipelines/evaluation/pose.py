@@ -147,10 +147,10 @@ def errors_of(
     for k, recording in enumerate(sessions):
         progress(k, len(sessions), f"measuring {recording.name}")
         scene, frames = build_scene(recording, plan, skeleton, len(recording))
-        found = subject.estimate(frames, scene, subject.find_size(frames, scene))
-        joints, *predicted = unpacked(subject, found)
-        truth = recording.joints_camera
-        parts.append(PoseErrors.compare(joints, truth, skeleton.tip, *predicted))
+        joints, *predicted = unpacked(
+            subject, subject.estimate(frames, scene, subject.find_size(frames, scene))
+        )
+        parts.append(PoseErrors.compare(joints, recording.joints_camera, skeleton.tip, *predicted))
     return PoseErrors.join(parts)
 
 
@@ -304,8 +304,11 @@ def evaluate_builds(
     for k, seed in enumerate(seeds):
         for name, family in (("other", "other"), ("usual", "train")):
             recording = film(animal, seed, k, family)
-            done = len(rows["other"]) + len(rows["usual"])
-            progress(done, 2 * len(seeds), f"measuring {recording.name}")
+            progress(
+                len(rows["other"]) + len(rows["usual"]),
+                2 * len(seeds),
+                f"measuring {recording.name}",
+            )
             rows[name].append(track(estimator, recording, plan_of(animal)))
     joints = estimator.skeleton.names
     figures = {name: build_figures(some, joints) for name, some in rows.items()}

@@ -242,8 +242,15 @@ def _side_by_side(recording: Path, folder: Path) -> dict[str, Any]:
     plan = Plan.load("mouse")
     with build_recording(recording, plan) as opened:
         tracker = build_tracker(opened, plan)
-        origin = build_provenance(opened, plan, tracker)
-        whole = Shard(str(recording), plan, tracker, origin, folder, 0, len(opened))
+        whole = Shard(
+            str(recording),
+            plan,
+            tracker,
+            build_provenance(opened, plan, tracker),
+            folder,
+            0,
+            len(opened),
+        )
     found = {}
     for name, (count, n_cores) in _CREWS.items():
         pool = _Timed(count, threads=1)

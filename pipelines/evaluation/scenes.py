@@ -124,8 +124,9 @@ def _measure_row(
         recording.files.known_digest = digest
         truths, skeleton = recording.animals, recording.skeleton
         individuals, sentences, code = run_product(recording, plan)
-        fits = skeleton.name == plan.animal.skeleton
-        tally.add(truths, individuals, n_frames, skeleton.tip, fits)
+        tally.add(
+            truths, individuals, n_frames, skeleton.tip, skeleton.name == plan.animal.skeleton
+        )
         said += [sentence for sentence in sentences if sentence not in said]
         exit_code = max(exit_code, code)
         if pictures is not None and k == 0:
@@ -172,8 +173,9 @@ def read_individuals(session: Session) -> list[MeasuredIndividual]:
     found = []
     for name, frames in session.frames.groupby("individual", sort=True):
         poses = session.poses[session.poses["individual"] == name]
-        arena = poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float).reshape(-1, n_joints, 3)
-        joints = T_camera_arena @ arena
+        joints = T_camera_arena @ poses[["x_mm", "y_mm", "z_mm"]].to_numpy(float).reshape(
+            -1, n_joints, 3
+        )
         if mirrored:
             joints = joints * [-1.0, 1.0, 1.0]
         trusted = (frames["flag"] == "").to_numpy(bool) & np.isfinite(joints).all(axis=(1, 2))

@@ -198,8 +198,11 @@ class SpeedSample:
 
     def every(self, step: int) -> SpeedSample:
         """The same frames with every so many-th pixel of rows and columns."""
-        frames = np.ascontiguousarray(self.frames[:, ::step, ::step])
-        return replace(self, frames=frames, scene=self.scene.every(step))
+        return replace(
+            self,
+            frames=np.ascontiguousarray(self.frames[:, ::step, ::step]),
+            scene=self.scene.every(step),
+        )
 
     def frames_per_s(
         self, subject: PoseEstimator | Baseline, parallel: bool, n_repeats: int
@@ -269,8 +272,9 @@ def _one_by_one(paper: PoseEstimator, footage: SpeedSample) -> NDArray[Any]:
     """Algorithm 1 as published, from frames to candidate scores, without shared steps."""
     method, skeleton, cascade = paper.model.method, paper.skeleton, paper.model.cascade
     crops = footage.scene.extract(footage.frames, 1.0, camera_view=method.camera_view)
-    crop_cameras = footage.scene.crop_cameras(crops, method.camera_view)
-    images = ImageSet(crops.heights, crop_cameras, crops.moments)
+    images = ImageSet(
+        crops.heights, footage.scene.crop_cameras(crops, method.camera_view), crops.moments
+    )
     n, k = len(crops.heights), method.n_candidates
     rotation, position, scale = start_poses(
         crops.moments,
@@ -359,8 +363,11 @@ def evaluate_live(
     progress(0, None, f"filming with {n_cameras} cameras at once")
     spawn = multiprocessing.get_context("spawn")
     with spawn.Manager() as manager, ProcessPoolExecutor(n_cameras, spawn) as pool:
-        together = partial(film, ready=manager.Barrier(n_cameras))
-        cameras = list(pool.map(together, range(_SEED, _SEED + n_cameras)))
+        cameras = list(
+            pool.map(
+                partial(film, ready=manager.Barrier(n_cameras)), range(_SEED, _SEED + n_cameras)
+            )
+        )
     numbers = {name: [one[name] for one in cameras] for name in _OF_EACH}
     latest = {
         name: max((one for one in numbers[name] if one is not None), default=None)
@@ -392,8 +399,9 @@ def _film(
         step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
         plan = plan_of(animal)
-        warm = arriving[: learn_frames + _WARM]
-        track_live(replayed(warm, 1000.0), plan, learn_frames=learn_frames)
+        track_live(
+            replayed(arriving[: learn_frames + _WARM], 1000.0), plan, learn_frames=learn_frames
+        )
         if ready is not None:
             ready.wait()
     except BaseException:

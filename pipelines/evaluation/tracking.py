@@ -153,8 +153,9 @@ def follow_sequence(
     Returns:
         By name, joints in the true arena frame; and the default tracker's speed, see `_speed`.
     """
-    n_sample = plan.foreground.n_background_frames
-    scene, sample = build_scene(recording, plan, estimator.skeleton, n_sample)
+    scene, sample = build_scene(
+        recording, plan, estimator.skeleton, plan.foreground.n_background_frames
+    )
     tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
     n = len(recording)
     parts: list[Observations] = []
@@ -224,8 +225,9 @@ def paper_rows(
     progress: Progress = silent,
 ) -> dict[str, Followed]:
     """Algorithms 1 and 3 on a sequence with the parts of the paper's variant, `PAPER_ROWS`."""
-    n_sample = plan.foreground.n_background_frames
-    scene, sample = build_scene(recording, plan, paper.skeleton, n_sample)
+    scene, sample = build_scene(
+        recording, plan, paper.skeleton, plan.foreground.n_background_frames
+    )
     size = paper.find_size(sample, scene)
     progress(0, len(PAPER_ROWS), f"Algorithm 1 as the paper has it on {recording.name}")
     found = {SINGLE: _single(recording, paper, scene, size)}
@@ -348,8 +350,7 @@ def search_noise(
     sequences = []
     for kind, seed in product(_KINDS, _SEARCH_SEEDS):
         recording = simulator.tracking_sequence(world, kind, seed=seed, n_frames=n_frames)
-        n_sample = plan.foreground.n_background_frames
-        scene, sample = build_scene(recording, plan, skeleton, n_sample)
+        scene, sample = build_scene(recording, plan, skeleton, plan.foreground.n_background_frames)
         sequences.append((recording, scene, estimator.find_size(sample, scene)))
 
     def mean_mm(

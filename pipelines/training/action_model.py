@@ -553,8 +553,9 @@ def suggest(
             "another"
         )
     track = track_of(opened)
-    found = recogniser.recognise(track, wall_of(opened))
-    rows = learning.doubtful_segments(found, track.times_ns, n, least_s)
+    rows = learning.doubtful_segments(
+        recogniser.recognise(track, wall_of(opened)), track.times_ns, n, least_s
+    )
     return pd.DataFrame(rows, columns=["start_s", "stop_s", "guess", "or_else", "uncertainty"])
 
 

@@ -134,8 +134,9 @@ def measure(
     recording = simulator.tracking_sequence(
         simulator.world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
     )
-    estimator = estimator_of(animal, "default", progress)
-    return observed(estimator, plan_of(animal), kind, recording, progress)
+    return observed(
+        estimator_of(animal, "default", progress), plan_of(animal), kind, recording, progress
+    )
 
 
 def other_builds(
@@ -383,8 +384,12 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
     for rows in np.array_split(np.argsort(stated, kind="stable"), min(3, len(stated))):
 
         def too_wide(factor: float, rows: NDArray[np.int64] = rows) -> bool:
-            inside = deviation[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
-            return bool(inside.mean() > 0.9)
+            return bool(
+                (
+                    deviation[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
+                ).mean()
+                > 0.9
+            )
 
         least, most = (0.3, 3.0)
         while too_wide(least) and least > 0.01:

@@ -190,8 +190,11 @@ def train_model(
         )
     model = make_model(skeleton, method_of(variant, skeleton), recipe, progress, draw)
     content, path = model.to_bytes(), Path(out)
-    sha256 = hashlib.sha256(content).hexdigest()
-    _store(path, content, {**model.card, "sha256": sha256, "bytes": len(content)})
+    _store(
+        path,
+        content,
+        {**model.card, "sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)},
+    )
     return path
 
 
@@ -200,8 +203,7 @@ def _store(path: Path, content: bytes, card: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:
         part.write_bytes(content)
-        text = json.dumps(card, indent=1, sort_keys=True)
-        write_whole(path.with_suffix(".json"), text + "\n")
+        write_whole(path.with_suffix(".json"), json.dumps(card, indent=1, sort_keys=True) + "\n")
 
 
 @serial_products()

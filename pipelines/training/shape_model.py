@@ -140,10 +140,10 @@ def _measured(
     """The mini-sessions of one block."""
     skeleton = estimator.skeleton
     size = windows.spine_mm / skeleton.length
-    camera_view = estimator.model.method.camera_view
-    crops, crop_cameras = extract(skeleton, windows, size, camera_view)
-    pose = Pose(view_of(crop_cameras) @ windows.root, windows.angles, windows.scale)
-    joints = pose.joints(skeleton)
+    crops, crop_cameras = extract(skeleton, windows, size, estimator.model.method.camera_view)
+    joints = Pose(view_of(crop_cameras) @ windows.root, windows.angles, windows.scale).joints(
+        skeleton
+    )
     for k in range(len(bodies)):
         rows = np.arange(k * PER_SESSION, (k + 1) * PER_SESSION)
         true = float(size[rows[0]])

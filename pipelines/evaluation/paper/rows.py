@@ -140,8 +140,9 @@ def is_other(crops: HeightMaps, crop_cameras: Array, recording: TrueRecording) -
     T = view_of(crop_cameras)
     joints = SE3(T.rotation[:, None], T.translation[:, None]) @ recording.joints_camera
     blob = crops.blobs
-    height = blob.volume_mm3 / np.maximum(blob.area_mm2, 1e-9)
-    centroid = np.stack([blob.x, blob.y, height], axis=-1)
+    centroid = np.stack(
+        [blob.x, blob.y, blob.volume_mm3 / np.maximum(blob.area_mm2, 1e-9)], axis=-1
+    )
     off = np.linalg.norm(centroid - joints.mean(axis=1), axis=-1)
     return np.asarray(crops.found & (off > 0.8 * recording.spine_mm))
 
@@ -215,8 +216,9 @@ def measured_rows(
             for name, subjects in runs.items():
                 for run, subject in enumerate(subjects):
                     joints, *predicted = measured(subject, frames, scene, view, cut)
-                    error = PoseErrors.compare(joints, recording.joints_camera, tip, *predicted)
-                    errors[name][run].append(error)
+                    errors[name][run].append(
+                        PoseErrors.compare(joints, recording.joints_camera, tip, *predicted)
+                    )
                     if not run:
                         first[name].append(joints)
         for name, row in rows.items():
@@ -482,8 +484,9 @@ def sensitivity(
         model = Model(replace(cascade, method=changed), metric, None, {})
         run = run_on(model, test, np.random.default_rng(recipe.seed))
         error = run.joint_error.mean(axis=1)
-        median = float(np.median(error))
-        curves[number].append({"value": value, "mean_mm": float(error.mean()), "median_mm": median})
+        curves[number].append(
+            {"value": value, "mean_mm": float(error.mean()), "median_mm": float(np.median(error))}
+        )
     return {
         "variant": variant,
         "n_images": len(data.size),
@@ -606,8 +609,9 @@ def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
     """Columns and rows (m, J, 2) of joints (m, J, 3) of one image's view in its height map."""
     packed = data.images.crop_cameras[image]
     camera = CropCamera(*packed)
-    joints = in_camera_frame(positions, np.repeat(packed[None], len(positions), 0))
-    x, y, z = np.moveaxis(joints, -1, 0)
+    x, y, z = np.moveaxis(
+        in_camera_frame(positions, np.repeat(packed[None], len(positions), 0)), -1, 0
+    )
     uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
     return (uv - [camera.u0, camera.v0]) / camera.step
 
@@ -668,12 +672,12 @@ def _visible_points(patches: Patches, k: int, T_arena_camera: SE3) -> Array:
     fx, fy, cx, cy = patches.intrinsics[k]
     z = depth[v, u]
     x = (u + patches.origin[k, 0] - cx) / fx * z
-    y = (v + patches.origin[k, 1] - cy) / fy * z
-    return np.asarray(T_arena_camera @ np.stack([x, y, z], axis=-1))
+    return np.asarray(
+        T_arena_camera @ np.stack([x, (v + patches.origin[k, 1] - cy) / fy * z, z], axis=-1)
+    )
 
 
 def _direction(path: Array) -> Array:
     """The main horizontal direction (2,) of a path (n, 3), pointing from its start to its end."""
-    off = path[:, :2] - path[:, :2].mean(axis=0)
-    axis = np.linalg.svd(off, full_matrices=False)[2][0]
+    axis = np.linalg.svd(path[:, :2] - path[:, :2].mean(axis=0), full_matrices=False)[2][0]
     return np.asarray(axis if (path[-1, :2] - path[0, :2]) @ axis >= 0 else -axis)

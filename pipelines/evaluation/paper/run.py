@@ -179,8 +179,7 @@ def run_tables(
         for one in results
     }
     path = folder / "results.json"
-    text = json.dumps(plain(numbers), indent=1, allow_nan=False)
-    path.write_text(text + "\n", encoding="utf-8")
+    path.write_text(json.dumps(plain(numbers), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     further = measure_further(folder, without, nyu, quick, progress)
     progress(0, None, "drawing")
     return [*written, path, *write_paper(folder, results, further, quick)]
@@ -417,11 +416,11 @@ def quick_runs(animal: str, variant: str, progress: Progress = silent) -> list[S
     training = training_of(variant, skeleton)
     if isinstance(training.plan, CnnPlan):
         require_torch()
-        plan = replace(training.plan, width=0.25, connected=128, epochs=1)
-        training = replace(training, plan=plan)
+        training = replace(
+            training, plan=replace(training.plan, width=0.25, connected=128, epochs=1)
+        )
     method = replace(method_of("paper", skeleton), session_size=False)
-    n_images = _QUICK_IMAGES[variant]
-    data = rendered_set(skeleton, method, training.recipe, 0, n_images, silent)
+    data = rendered_set(skeleton, method, training.recipe, 0, _QUICK_IMAGES[variant], silent)
     return [fit(training, data, skeleton, lambda share, what: None)]
 
 
@@ -481,5 +480,8 @@ def _actions(animal: str, stride: int, progress: Progress) -> dict[str, Any]:
         for side in (False, True)
     )
     progress(0, None, "naming actions")
-    scores = sequence_scores(train, test, load_action_model(animal))
-    return {**scores, "n_train": len(train), "n_test": len(test)}
+    return {
+        **sequence_scores(train, test, load_action_model(animal)),
+        "n_train": len(train),
+        "n_test": len(test),
+    }
