@@ -48,7 +48,6 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.training.pose_model import train_model
     from liex_lab.pipelines.training.shape_model import train_shape
     from liex_lab.pipelines.verify import verify_session
-    from liex_lab.sessions.corrections import Correction
 
 _JOBS = {  # function: the module of `pipelines` that defines it
     "run_session": "session",
@@ -195,6 +194,7 @@ def serve_dashboard(
         StudyError: there is no such study.
     """
     import secrets
+    from functools import partial
 
     from liex_lab.pipelines.study.run import list_sessions
 
@@ -213,29 +213,16 @@ def serve_dashboard(
     from liex_lab.sessions.viewer import show_replay
 
     place = Path(study) if Path(study).is_dir() else Path(study).parent
-    name, look = list_sessions(study)
-    data = StudyData(name, look)
+    data = StudyData(*list_sessions(study))
     data.warm(progress)
     alone = host in LOOPBACK
     token = secrets.token_urlsafe(24)
-
-    def correct(folder: Path, what: Sequence[Correction], undo: Sequence[int], author: str) -> None:
-        """Correct a session on behalf of the dashboard.
-
-        Args:
-            folder: the session folder.
-            what: corrections to add.
-            undo: numbers of corrections to undo.
-            author: author of the corrections.
-        """
-        correct_session(folder, what, undo=undo, author=author, report=False)
-
     app = make_app(
         data,
         token=token,
         alone=alone,
         show_replay=show_replay if alone else None,
-        correct=correct,
+        correct=partial(correct_session, report=False),
         report=write_views,
         suggest=suggest,
         reviews=place / REVIEWS,

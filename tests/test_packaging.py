@@ -8,8 +8,6 @@ import sysconfig
 import tomllib
 from pathlib import Path
 
-import pytest
-
 from tests.conftest import REPOSITORY
 
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
@@ -105,19 +103,6 @@ def python_in_the_clone(*arguments: str, clone: Path = REPOSITORY) -> str:
     )
     assert ran.returncode == 0, ran.stderr[-2000:]
     return ran.stdout
-
-
-@pytest.mark.nightly  # tests/test_pages.py runs it in every run, in another folder
-def test_the_readmes_snippet_runs_in_the_folder_of_the_clone(tmp_path: Path) -> None:
-    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    recording = "synthetic:walk?seed=3&frames=40"
-    for name, value in (("datasets/mouse_walk.mcap", recording), ("results", str(tmp_path))):
-        assert f'"{name}"' in snippet
-        snippet = snippet.replace(f'"{name}"', repr(value))
-    printed = python_in_the_clone("-c", snippet).splitlines()
-    assert len(printed) == 2
-    assert list(tmp_path.glob("*.liex/report.html"))
 
 
 def test_everything_is_importable_in_the_folder_of_the_clone(tmp_path: Path) -> None:

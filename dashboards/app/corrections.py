@@ -8,7 +8,7 @@ corrections. A page polls the state of its corrections.
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +34,7 @@ from ..figures.animals import Array
 from .data import StudyData
 from .desk import Desk, Desks, Stretch, coloured_actions
 
-Correct = Callable[[Path, Sequence[Correction], Sequence[int], str], object]
+Correct = Callable[..., object]
 Report = Callable[[Path], object]
 
 SAVED = "saved"
@@ -73,7 +73,8 @@ class Saver:
     Thread-safe.
 
     Args:
-        correct: adds corrections to the session in a folder, or undoes some, with the author.
+        correct: adds corrections to the session in a folder, or undoes some; called with the
+            folder, the corrections, and `undo` and `author`.
         report: makes the report of the session in a folder again; None if `correct` does.
         calm_s: time without corrections before a session's report is made again, s.
     """
@@ -181,7 +182,7 @@ class Saver:
         what = [ticket.what for ticket in batch if ticket.what is not None]
         undo = [ticket.undoes for ticket in batch if ticket.what is None]
         try:
-            self._correct(folder, what, undo, batch[0].author)
+            self._correct(folder, what, undo=undo, author=batch[0].author)
             for entry in reversed(read_log(folder).entries):
                 for ticket in reversed(batch):
                     made = (entry.what, entry.undoes) == (ticket.what, ticket.undoes)

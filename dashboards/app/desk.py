@@ -269,9 +269,11 @@ def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretc
     """
     # 90 mm for an animal of unknown length
     spine_mm = float(session.metadata["animal"].get("spine_mm") or 90.0)
-    found: list[Stretch] = []
-    for animal in animals:
-        found += [*_exchanged_ends(animal), *_jumps(session, animal, spine_mm)]
+    found = [
+        stretch
+        for animal in animals
+        for stretch in (*_exchanged_ends(animal), *_jumps(session, animal, spine_mm))
+    ]
     for one, other in combinations(animals, 2):
         if len(one.xy_mm) and len(one.xy_mm) == len(other.xy_mm):
             away_mm = np.linalg.norm(one.xy_mm - other.xy_mm, axis=1)

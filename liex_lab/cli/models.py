@@ -178,12 +178,13 @@ def benchmark(
 def show_poses(result: Result) -> None:
     """Print the numbers of a split; for other-build, a row for each kind of build."""
     if "usual" not in result:
-        tell_numbers(result)
-        return
-    rows = {}
-    for kind in ("other", "usual"):
-        rows[kind] = {k: v for k, v in result[kind].items() if not isinstance(v, dict | list)}
-    tell_rows(rows)
+        return tell_numbers(result)
+    tell_rows(
+        {
+            kind: {k: v for k, v in result[kind].items() if not isinstance(v, dict | list)}
+            for kind in ("other", "usual")
+        }
+    )
 
 
 @benchmark("pose", show_poses)

@@ -214,12 +214,12 @@ def _recogniser(
 
 def cut_out(tracks: Sequence[LabelledTrack]) -> list[LabelledTrack]:
     """Every named bout of at least seven frames as a track of its own."""
-    found = []
-    for one in tracks:
-        for start, stop, word in zip(*ethogram.runs_of(one.words), strict=True):
-            if word and stop - start >= 7:
-                found.append(one[slice(start, stop)])
-    return found
+    return [
+        one[slice(start, stop)]
+        for one in tracks
+        for start, stop, word in zip(*ethogram.runs_of(one.words), strict=True)
+        if word and stop - start >= 7
+    ]
 
 
 def paper_names(

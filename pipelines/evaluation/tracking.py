@@ -115,10 +115,15 @@ def evaluate_tracking(
     rows, speed = follow_sequence(recording, estimator, plan, progress)
     if rival is not None:
         rows |= paper_rows(recording, rival, plan, progress)
-    table = {}
-    for name, row in rows.items():
-        alone = rows[SINGLE if name in PAPER_ROWS else "single"]
-        table[name] = tracking_figures([row], [alone], [recording.events], recording.spine_mm)
+    table = {
+        name: tracking_figures(
+            [row],
+            [rows[SINGLE if name in PAPER_ROWS else "single"]],
+            [recording.events],
+            recording.spine_mm,
+        )
+        for name, row in rows.items()
+    }
     result = {
         "animal": animal,
         "sequence": sequence,

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,6 @@ from liex_lab.pipelines.region_config import StatedRegions
 from liex_lab.pipelines.study.run import list_sessions
 
 from liex_lab.api import correct_session
-from liex_lab.sessions.corrections import Correction
-
-
-def correct(folder: Path, what: Sequence[Correction], undo: Sequence[int], author: str) -> None:
-    correct_session(folder, what, undo=undo, author=author, report=False)
 
 
 class Served:
@@ -30,7 +25,7 @@ class Served:
         app = make_app(
             data,
             show_replay=lambda replay, at_s: self.asked.append((replay, at_s)),
-            correct=correct,
+            correct=partial(correct_session, report=False),
             reviews=(study if study.is_dir() else study.parent) / "reviews",
             regions=StatedRegions(study),
             **more,

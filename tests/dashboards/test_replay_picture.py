@@ -19,12 +19,8 @@ import pytest
 from liex_lab.dashboards.replay.layouts import replay_blueprint
 
 from liex_lab.api import correct_session
-from liex_lab.recordings.depth_kernels import to_millimetres
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import joint_move
-from liex_lab.sessions.rrd import ReplayWriter
-from liex_lab.sessions.rrd_scene import packed
-from tests.sessions.test_cutouts import MOUSE as KEPT_MOUSE
 from tests.sessions.test_cutouts import written
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -161,28 +157,6 @@ def test_the_viewer_complains_of_nothing_however_much_depth_is_kept(
     looked_at(written(tmp_path / "kept.liex", depth, blueprint=replay_blueprint))
 
 
-def test_the_viewer_complains_of_nothing_where_whole_pictures_are_laid_over_cut_outs(
-    tmp_path: Path,
-) -> None:
-    session = written(tmp_path / "cut.liex", "animal", blueprint=replay_blueprint)
-    over = tmp_path / "over.rrd"
-    whole = ReplayWriter(over, KEPT_MOUSE.provenance())
-    rng = np.random.default_rng(5)
-    read = [to_millimetres(KEPT_MOUSE.frame(row).depth) for row in range(len(KEPT_MOUSE.times_s))]
-    for row in (3, 4, 5, 6):  # too noisy for RVL
-        noisy = read[row] + rng.normal(0.0, 6.0, read[row].shape)
-        read[row] = (5.0 * np.rint(noisy / 5.0)).astype(np.uint16)
-    whole.add(list(range(len(read))), KEPT_MOUSE.times_ns.tolist(), read)
-    whole.flushed()
-    whole.abandon()
-    kinds = {packed(depth)[1] for depth in read}
-    assert kinds == {"application/rvl", "image/png"}
-    both = looked_at(session, over)
-    alone = looked_at(session)
-    for moment in MOMENTS:
-        assert (both[moment] != alone[moment]).any()
-
-
 def test_where_depth_is_cut_out_around_the_animal_it_is_zoomed_and_followed(tmp_path: Path) -> None:
     session = written(tmp_path / "cut.liex", "animal", blueprint=replay_blueprint)
     shown = looked_at(session)
@@ -208,15 +182,6 @@ def test_the_two_moments_differ_where_the_animal_moved_and_the_skeleton_lies_on_
         assert joints.sum() > 40
         assert near[joints].mean() > 0.95
     assert not (joints_in(first) & joints_in(second)).any()
-
-
-def test_the_skeleton_moved_as_the_track_says(pictures, session: Session) -> None:
-    at = [np.argwhere(joints_in(pictures[moment])).mean(axis=0)[::-1] for moment in MOMENTS]
-    uv = session.poses[["u_px", "v_px"]].to_numpy(float).reshape(-1, 5, 2).mean(axis=1)
-    seen, told = at[1] - at[0], uv[MOMENTS[1]] - uv[MOMENTS[0]]
-    cosine = seen @ told / np.linalg.norm(seen) / np.linalg.norm(told)
-    assert cosine > 0.995
-    assert np.linalg.norm(seen) > 60.0
 
 
 def test_what_was_corrected_is_shown_in_place_of_what_was_measured(

@@ -7,14 +7,12 @@ import pytest
 from liex_lab.pipelines.training import shape_model
 from liex_lab.pipelines.training.shape_model import PER_SESSION, MiniSession, mini_sessions
 
-from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior
 from liex_lab.simulation import training_patches
-from liex_lab.simulation.species import FishSpecies
-from liex_lab.simulation.training_patches import BLOCK, training_blocks
+from liex_lab.simulation.training_patches import BLOCK
 
 N = BLOCK // PER_SESSION
 
@@ -55,32 +53,6 @@ def test_a_mini_session_tells_the_build_of_the_animal_that_was_rendered(others):
     width = np.exp(labels[:, -2 * len(PLACES) : -len(PLACES)])
     assert len(others) > 0.8 * N
     assert np.corrcoef(seen[:, 9], width[:, 2])[0, 1] > 0.9  # near 0.4 of the length
-
-
-@pytest.mark.nightly
-def test_bodies_of_a_block_are_those_that_it_shows():
-    drawn = {"family": "wide", "per_session": PER_SESSION, "degraded_share": 0.5}
-    species = FishSpecies()
-    (block,) = training_blocks(5, 1, species, window_px=272, **drawn)
-    bodies = block.body[::PER_SESSION]
-    assert isinstance(bodies, BodyShape)
-    assert len(bodies) == N
-    # what is read over a joint of the trunk is the skin of these very bodies, in the median
-    j, skeleton = 6, species.skeleton
-    joint = block.joints_mm[:, j]
-    u, v = (
-        np.rint(block.intrinsics[:, k] * joint[:, k] / joint[:, 2] + block.intrinsics[:, 2 + k])
-        - block.origin[:, k]
-        for k in range(2)
-    )
-    depth = block.depth[np.arange(BLOCK), v.astype(int), u.astype(int)] * block.unit_mm
-    over = np.where((depth > 0) & (joint[:, 2] - depth < 12.0), joint[:, 2] - depth, np.nan)
-    over = np.nanmedian(over.reshape(N, PER_SESSION), axis=1)
-    stations = skeleton.surface["stations"]
-    height = np.array([np.interp(j / 20, stations, one) for one in bodies.half_height])
-    height *= block.spine_mm[::PER_SESSION] / skeleton.length
-    assert np.corrcoef(over, height)[0, 1] > 0.9
-    assert abs(np.median(over - height)) < 0.2
 
 
 @pytest.mark.nightly
