@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from liex_lab.dashboards.app.page_region import scene_svg
+from liex_lab.dashboards.app.server import scene_svg
 from liex_lab.dashboards.figures.animals import read_cutout
 from liex_lab.dashboards.report.contact_sheet import (
     Mark,
