@@ -58,8 +58,8 @@ def day(iso: str) -> str:
     except ValueError:
         return iso
     zone = when.strftime("%z")
-    told = f" (UTC{zone[:3]}:{zone[3:5]})" if zone else ""
-    return f"{when.day} {when:%B %Y, %H:%M:%S}{told}"
+    offset = f" (UTC{zone[:3]}:{zone[3:5]})" if zone else ""
+    return f"{when.day} {when:%B %Y, %H:%M:%S}{offset}"
 
 
 # Texts from Jinja templates

@@ -75,7 +75,7 @@ class Desk(Footage):
             "joints": [str(name) for name in animal["joints"]],
             "bones": self.bones,
             "animals": [
-                {"name": one.who, "half_px": half}
+                {"name": one.label, "half_px": half}
                 for one, (_, half) in zip(self.animals, self.paths, strict=True)
             ],
             "actions": coloured_actions(list(self.session.metadata.get("actions") or {})),

@@ -56,7 +56,7 @@ class SessionAnimal:
     group: str = ""
 
     @property
-    def who(self) -> str:
+    def label(self) -> str:
         """Its name in titles: the subject if present, else the session."""
         name = self.subject or self.session.name
         return name if self.alone else f"{name}, {self.individual}"

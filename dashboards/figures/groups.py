@@ -60,8 +60,8 @@ def by_group(animals: Sequence[SessionAnimal]) -> Grouped:
     out: dict[str, dict[str, list[SessionAnimal]]] = {
         animal.group or NO_GROUP: {} for animal in animals
     }
-    for animal in sorted(animals, key=lambda one: one.who):
-        out[animal.group or NO_GROUP].setdefault(animal.who, []).append(animal)
+    for animal in sorted(animals, key=lambda one: one.label):
+        out[animal.group or NO_GROUP].setdefault(animal.label, []).append(animal)
     return out
 
 
@@ -111,8 +111,8 @@ def occupancy_by_subject(animals: Sequence[SessionAnimal]) -> Figure | None:
     """Heatmaps of every subject, the sum of its sessions; None without a known position."""
     panels = []
     for group, subjects in _occupancies(animals).items():
-        for who, (session, found) in subjects.items():
-            text = f"{who} ({group}), {found.observed_s:.1f} s\nn = {counted(found.n, 'frame')}"
+        for subject, (session, found) in subjects.items():
+            text = f"{subject} ({group}), {found.observed_s:.1f} s\nn = {counted(found.n, 'frame')}"
             panels.append((text, session, found))
     title = f"Occupancy by subject, n = {counted(len(panels), 'subject')}"
     return occupancy_panels(title, panels)
@@ -319,8 +319,8 @@ def _strip(
         of_animals = zip(keys.groupby(animal).first(), names_of, sizes, means, strict=True)
         large.set_urls(
             [
-                link(key) + quote(f"#animal {who}, {n}: {mean:.4g}", "#")
-                for key, who, n, mean in of_animals
+                link(key) + quote(f"#animal {subject}, {n}: {mean:.4g}", "#")
+                for key, subject, n, mean in of_animals
             ]
         )
         if small is not None:
@@ -387,8 +387,8 @@ def _occupancies(
 
     return {
         group: {
-            who: (sessions[0].session, _added([framed(animal) for animal in sessions]))
-            for who, sessions in subjects.items()
+            subject: (sessions[0].session, _added([framed(animal) for animal in sessions]))
+            for subject, sessions in subjects.items()
         }
         for group, subjects in by_group(animals).items()
     }

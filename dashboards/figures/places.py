@@ -183,7 +183,7 @@ def occupancy_map(animal: SessionAnimal) -> Figure | None:
         return None
     figure, axes = one_panel(
         *_FLOOR,
-        f"Occupancy, {animal.who}\nn = {counted(found.n, 'frame')}, "
+        f"Occupancy, {animal.label}\nn = {counted(found.n, 'frame')}, "
         f"{found.observed_s:.1f} s observed",
     )
     image = draw_occupancy(axes, found, _most(found))
@@ -199,7 +199,7 @@ def trajectory(animal: SessionAnimal) -> Figure | None:
         return None
     figure, axes = one_panel(
         *_FLOOR,
-        f"Trajectory, {animal.who}\nn = {counted(int(known.sum()), 'frame')}, "
+        f"Trajectory, {animal.label}\nn = {counted(int(known.sum()), 'frame')}, "
         f"{animal.hold_s[known].sum():.1f} s observed",
     )
     unit, size = time_unit(animal.duration_s)

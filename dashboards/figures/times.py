@@ -69,7 +69,8 @@ def ethogram(animal: SessionAnimal, span_s: Span | None = None) -> Figure | None
     figure, axes = one_panel(
         (TWO_COLUMNS_MM, height + 15.0),
         (LEFT_MM, 8.0, width, height),
-        f"Ethogram, {animal.who}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no frame",
+        f"Ethogram, {animal.label}, n = {counted(len(bouts), 'bout')}; hatched: no pose or no "
+        "frame",
     )
     _, size = time_unit(last_s - first_s)
     # bouts closer than 0.05 mm on paper are one bar
@@ -137,7 +138,7 @@ def curves(
                     linewidth=0.0,
                 )
         axes.set_title(
-            f"{title}, {animal.who}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
+            f"{title}, {animal.label}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
         kept = kept_rows(values[near], _MOST_COLUMNS)
         # a marker for each value of a short stretch
@@ -158,7 +159,7 @@ def cumulative_distance(animal: SessionAnimal) -> Figure | None:
         return None
     time_s, metres, n = walked(animal)
     _, size = time_unit(animal.duration_s)
-    title = f"Cumulative distance, {animal.who}\n{metres[-1]:.2f} m, n = {counted(n, 'frame')}"
+    title = f"Cumulative distance, {animal.label}\n{metres[-1]:.2f} m, n = {counted(n, 'frame')}"
     figure, axes = one_panel((ONE_COLUMN_MM, 52.0), _SMALL_BOX, title)
     rows = kept_rows(metres, _MOST_COLUMNS)
     axes.plot(time_s[rows] / size, metres[rows], color=BLUE, linewidth=1.0)
@@ -219,7 +220,7 @@ def distribution(
         np.minimum(values, top), bins=30, range=(0.0, top), weights=hold_s[known]
     )
     share = 100.0 * share / max(share.sum(), 1e-9)
-    title = f"{title}, {animal.who}\nn = {counted(len(values), 'frame')}"
+    title = f"{title}, {animal.label}\nn = {counted(len(values), 'frame')}"
     figure, axes = one_panel((ONE_COLUMN_MM, 52.0), _SMALL_BOX, title)
     axes.bar(edges[:-1], share, np.diff(edges), align="edge", color=colour, gid="distribution")
     median = float(np.median(values))
@@ -296,7 +297,7 @@ def time_budget(animal: SessionAnimal) -> Figure | None:
         (ONE_COLUMN_MM, 4.0 * len(words) + 22.0),
         (LEFT_MM, 9.0, ONE_COLUMN_MM - LEFT_MM - 12.0, 4.0 * len(words)),
     )
-    heading(figure, f"Time budget, {animal.who}\nn = {counted(len(animal.bouts), 'bout')}")
+    heading(figure, f"Time budget, {animal.label}\nn = {counted(len(animal.bouts), 'bout')}")
     axes.barh(range(len(words)), shares, 0.76, color=[colours[word] for word in words])
     for k, (share, n) in enumerate(zip(shares, n_bouts, strict=True)):
         count = "" if n is None else f"n = {n}"
@@ -341,7 +342,7 @@ def activity(animal: SessionAnimal) -> Figure | None:
     figure, axes = one_panel(
         (TWO_COLUMNS_MM, low + 31.0),
         (LEFT_MM, low, TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM, 23.0),
-        f"Shares over the session, {animal.who}, n = {counted(len(table), 'interval')} of "
+        f"Shares over the session, {animal.label}, n = {counted(len(table), 'interval')} of "
         f"{stop[0] - start[0]:.3g} s",
     )
     below = np.zeros(len(table))
@@ -393,8 +394,8 @@ def transitions(animal: SessionAnimal) -> Figure | None:
     n = int(np.nansum(found["n"]))
     heading(
         figure,
-        f"Transitions, {animal.who}, n = {counted(n, 'transition')}; percentage of transitions out "
-        "of each row\n(in brackets: expected by chance); blue: more, orange: less often than "
+        f"Transitions, {animal.label}, n = {counted(n, 'transition')}; percentage of transitions "
+        "out of each row\n(in brackets: expected by chance); blue: more, orange: less often than "
         f"chance (corrected p ≤ {CERTAIN:g})",
     )
     return figure
@@ -497,7 +498,7 @@ def aligned_curves(animal: SessionAnimal) -> Figure | None:
         axes.set_ylabel(f"{title.lower()}, {unit}")
         if line == lines - 1 or k + _BESIDE >= len(rows):
             axes.set_xlabel("time from the onset, s")
-    heading(figure, f"About the onsets, {animal.who}: median and quartiles over the bouts")
+    heading(figure, f"About the onsets, {animal.label}: median and quartiles over the bouts")
     return figure
 
 

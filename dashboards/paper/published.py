@@ -56,17 +56,17 @@ DEVIATIONS = (
     "Tests tried at a node of a tree, m: 100; the paper has 8,000.",
     "Training images: 16,384 (fish), 40,960 (mouse) and 20,480 (hand), rendered; the paper has "
     "95,104, 104,096 and 72,757, made from photographs. The paper's variant, RF and CNN learn from "
-    "the same pictures: animals near home size, half of the pictures with more noise. Ours learns "
-    "from 16,384, 49,152 and 20,480 such pictures, of fish and mice of several sizes.",
-    "Further pictures, which no tree was grown on: 4,096 (mouse) and 2,048 (fish, hand) for the "
+    "the same images: animals near home size, half of the images with more noise. Ours learns "
+    "from 16,384, 49,152 and 20,480 such images, of fish and mice of several sizes.",
+    "Further images, which no tree was grown on: 4,096 (mouse) and 2,048 (fish, hand) for the "
     "predicted error of the paper's variant, none for RF and CNN. Ours has 4,096 (fish) and 12,288 "
     "(mouse) for the correction of a pose, 4,096 (fish, hand) and 24,576 (mouse) for its predicted "
     "error, and 49,152 (mouse) for telling head from tail.",
     "Trainings: three of the paper's variant and its ablations; one of ours, of RF and of CNN, so "
-    "nothing tells how much of their numbers is the luck of one training.",
-    "Clean, hard and other-body are no untouched tests of ours: they were looked at while it was "
+    "nothing shows how much of their numbers is the luck of one training.",
+    "Clean, hard and other-body are no untouched tests of ours: they were inspected while it was "
     "made, and choices were made by what they showed, such as the network that tells head from "
-    "tail by other-body. The sealed split was not looked at.",
+    "tail by other-body. The sealed split was not inspected.",
     "Leaves hold 5 examples at most, rounds C, trees, depths and initial poses Kt are as in the "
     "paper; a node has 20 thresholds, a tree sees 63 % of the images, and the mean shift goes in "
     "four steps from the mean vote, with a bandwidth of 10 mm of a mouse; all of this the paper "
@@ -76,7 +76,7 @@ DEVIATIONS = (
     "Offsets of the features are projected to first order, and reach 0.3 times as far in depth as "
     "across.",
     "Which of two objects is the animal, and how large it is, our default model says for all rows; "
-    "the paper has one object in a picture and skeletons of 'proper scaling'. RF and CNN are told "
+    "the paper has one object in an image and skeletons of 'proper scaling'. RF and CNN are told "
     "no size, as in the paper.",
     "RF: how its forests vote, and that F2 learns where F1 took no tail for a head, is chosen "
     "here.",

@@ -285,7 +285,7 @@ def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
                         film,
                         start,
                         min(float(bout["stop_s"]) + 0.5, end, start + 6.0),
-                        animal.who,
+                        animal.label,
                         k,
                     )
                 )

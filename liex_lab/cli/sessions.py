@@ -522,14 +522,14 @@ def dashboard(
     """Open a study in the browser; Ctrl+C stops the server."""
     with progress_bar() as progress, ExitStack() as stack:
 
-        def told(address: str) -> None:
+        def announce(address: str) -> None:
             """Print the dashboard's `address`, and open it if requested."""
             say(f"dashboard: {address}   (Ctrl+C ends it)")
             if open_browser:  # by a file: other accounts can read a program's arguments
                 folder = stack.enter_context(TemporaryDirectory(prefix="liex-"))
                 webbrowser.open(page_that_opens(address, Path(folder)).as_uri())
 
-        api.serve_dashboard(study, host=host, port=port, told=told, progress=progress)
+        api.serve_dashboard(study, host=host, port=port, told=announce, progress=progress)
 
 
 def page_that_opens(address: str, folder: Path) -> Path:

@@ -109,7 +109,7 @@ def evaluate_scenes(
 
 
 def _measure_row(
-    name: str, case: Case, seeds: Sequence[int], n_frames: int, pictures: Path | None
+    name: str, case: Case, seeds: Sequence[int], n_frames: int, folder: Path | None
 ) -> dict[str, Any]:
     """Results of one row over some recordings."""
     scene, of_plan, _ = case
@@ -129,8 +129,8 @@ def _measure_row(
         )
         said += [sentence for sentence in sentences if sentence not in said]
         exit_code = max(exit_code, code)
-        if pictures is not None and k == 0:
-            draw_scene(name, recording, truths, individuals, pictures)
+        if folder is not None and k == 0:
+            draw_scene(name, recording, truths, individuals, folder)
     return {**tally.figures(), "said": said, "exit_code": exit_code}
 
 

@@ -63,14 +63,14 @@ class StudyPlan:
         )
         animal = np.repeat(np.arange(n_animals), self.n_sessions)
         values = mean[animal] + rng.normal(0, self.sd_session, (len(animal), n_studies))
-        who = pd.DataFrame(
+        animals = pd.DataFrame(
             {
                 "subject_id": [f"m{k:03d}" for k in animal],
                 "cage": [f"c{k:02d}" if self.caged else "" for k in cage[animal]],
                 "group": np.where(treated[animal], "treated", "control"),
             }
         )
-        return who.join(pd.DataFrame(values, columns=[f"study_{k}" for k in range(n_studies)]))
+        return animals.join(pd.DataFrame(values, columns=[f"study_{k}" for k in range(n_studies)]))
 
 
 PLANS = (

@@ -252,7 +252,7 @@ def test_every_name_of_the_transitions_is_on_the_paper():
     )
     for first in range(n):  # each of them stands once at each place of the circle
         own = words[first:] + words[:first]
-        one: Any = SimpleNamespace(who="m01", words=own, table=lambda name: table)
+        one: Any = SimpleNamespace(label="m01", words=own, table=lambda name: table)
         with drawing():
             figure = times.transitions(one)
             assert figure is not None
