@@ -34,54 +34,63 @@ WHAT_TO_WRITE = (
     "fps = 30.0 where there is no timestamps.csv"
 )
 _INTRINSICS = ("fx", "fy", "cx", "cy")
-_NUMBERS = (*_INTRINSICS, "width", "height", "unit_mm", "fps")
-_WORDS: dict[str, tuple[str, ...]] = {  # keys with a fixed set of values
-    "encoding": tuple(ENCODINGS),
-    "byte_order": ("big", "little"),
-    "time_unit": tuple(UNITS),
-}
-_KEYS = (
-    *_NUMBERS,
-    "unread",
-    "distortion",
-    "time_column",
-    "timestamps",
-    "pattern",
-    "subject_id",
-    "session_start_time",
-    "distortion_model",
-    *_WORDS,
-)
 
 
-_TEXT = (
-    lambda value: isinstance(value, str) and value != "",
-    "it is a text in quotation marks",
+def _is_number(value: Any, finite: bool = True) -> bool:
+    return type(value) in (int, float) and (math.isfinite(value) or not finite)
+
+
+_TEXT = (lambda value: isinstance(value, str) and value != "", "it is a text in quotation marks")
+_PIXELS = (
+    lambda value: _is_number(value) and value >= 1 and value == int(value),
+    "it is a positive whole number of pixels",
 )
+_FOCAL = (
+    lambda value: _is_number(value) and 1e-3 < value < 1e7,  # limits far beyond any camera
+    "a focal length is a positive number of pixels, some hundreds of most cameras",
+)
+_NUMBER = (_is_number, "it is a number")
 _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {  # key: valid values, and how to state them
-    **dict.fromkeys(
-        ("width", "height"),
-        (
-            lambda value: value >= 1 and value == int(value),
-            "it is a positive whole number of pixels",
-        ),
+    "fx": _FOCAL,
+    "fy": _FOCAL,
+    "cx": _NUMBER,
+    "cy": _NUMBER,
+    "width": _PIXELS,
+    "height": _PIXELS,
+    "fps": _NUMBER,
+    "unit_mm": (
+        lambda value: _is_number(value) and value != 0,
+        "it is the number of millimetres in one stored step",
     ),
-    **dict.fromkeys(
-        ("fx", "fy"),
-        (
-            lambda value: 1e-3 < value < 1e7,  # limits far beyond any camera
-            "a focal length is a positive number of pixels, some hundreds of most cameras",
+    "unread": (
+        lambda value: all(
+            _is_number(one, finite=False) for one in (value if isinstance(value, list) else [value])
         ),
+        "it is a list of stored numbers, as in [0, 65535]",
     ),
-    "unit_mm": (bool, "it is the number of millimetres in one stored step"),
+    "distortion": (
+        lambda value: isinstance(value, list) and all(map(_is_number, value)),
+        "it is a list of coefficients, as in [-0.1, 0.02, 0, 0]",
+    ),
+    "distortion_model": _TEXT,
     "time_column": (
         lambda value: value != "" if isinstance(value, str) else type(value) is int and value >= 0,
         "it is a column's name, or its number from 0",
     ),
-    **dict.fromkeys(("timestamps", "pattern", "subject_id", "distortion_model"), _TEXT),
+    "timestamps": (
+        lambda value: _TEXT[0](value) and named_beside(value),
+        "it is a file in the recording's own folder, written from there without ..",
+    ),
+    "pattern": _TEXT,
+    "subject_id": _TEXT,
+    "session_start_time": (lambda value: True, "it is a date and time"),
     **{
         key: (words.__contains__, "it is one of " + ", ".join(f'"{word}"' for word in words))
-        for key, words in _WORDS.items()
+        for key, words in {
+            "encoding": tuple(ENCODINGS),
+            "byte_order": ("big", "little"),
+            "time_unit": tuple(UNITS),
+        }.items()
     },
 }
 
@@ -154,8 +163,8 @@ class CameraFile:
             if isinstance(document.get(name), dict):
                 table |= document[name]
         problems = []
-        for key in (key for key in table if key not in _KEYS):
-            hint = did_you_mean(key, _KEYS, "; did you mean '{}'?")
+        for key in (key for key in table if key not in _RULES):
+            hint = did_you_mean(key, _RULES, "; did you mean '{}'?")
             problems.append(f"{path.name} has a key {key!r} that means nothing here{hint}")
         return _from_table(path, table, tuple(problems))
 
@@ -243,69 +252,43 @@ def rate(fps: float | None, where: str) -> float | None:
 
 
 def _from_table(path: Path, table: dict[str, Any], problems: tuple[str, ...]) -> CameraFile:
-    numbers = {key: _number(path, key, table[key]) for key in _NUMBERS if key in table}
-    unread = table.get("unread", [0])
-    unread = unread if isinstance(unread, list) else [unread]
     for key, (is_valid, meaning) in _RULES.items():
         if key in table and not is_valid(table[key]):
             raise RecordingError(f"{path} states {key} = {table[key]!r}; {meaning}")
-    if not named_beside(table.get("timestamps", "timestamps.csv")):
-        raise RecordingError(
-            f"{path} states timestamps = {table['timestamps']!r}; it is a file in the recording's "
-            "own folder, written from there without .."
-        )
+    unread = table.get("unread", [0])
     metadata = {"subject_id": table["subject_id"]} if "subject_id" in table else {}
     if "session_start_time" in table:
         start = start_of_day(table["session_start_time"])
-        if start is None:
-            problems += (
+        metadata |= {} if start is None else {"session_start_time": start}
+        problems += (
+            ()
+            if start
+            else (
                 f"session_start_time in {path} has no time zone, so it was not used; write "
                 "2024-05-01T10:00:00Z",
             )
-        else:
-            metadata["session_start_time"] = start
-    return CameraFile(
-        path=path,
-        intrinsics={key: numbers[key] for key in _INTRINSICS if key in numbers},
-        width=int(numbers["width"]) if "width" in numbers else None,
-        height=int(numbers["height"]) if "height" in numbers else None,
-        unit_mm=numbers.get("unit_mm", ENCODINGS[table.get("encoding", "linear")]),
-        states_unit="unit_mm" in numbers,
-        unread=tuple(_number(path, "unread", value, finite=False) for value in unread),
-        encoding=table.get("encoding", "linear"),
-        byte_order=table.get("byte_order"),
-        fps=rate(numbers.get("fps"), str(path)),
-        timestamps=table.get("timestamps", "timestamps.csv"),
-        time_column=table.get("time_column"),
-        time_unit=table.get("time_unit"),
-        pattern=table.get("pattern", "*"),
-        metadata=metadata,
-        problems=problems,
-        distortion=_distortion(path, table),
-    )
-
-
-def _distortion(path: Path, table: dict[str, Any]) -> Distortion | None:
-    values = table.get("distortion", [])
-    if not isinstance(values, list):
-        raise RecordingError(
-            f"{path} states distortion = {values!r}; it is a list of coefficients, as in [-0.1, "
-            "0.02, 0, 0]"
         )
-    coefficients = [_number(path, "distortion", value) for value in values]
     try:
-        return Distortion.of(table.get("distortion_model", "plumb_bob"), coefficients)
+        distortion = Distortion.of(
+            table.get("distortion_model", "plumb_bob"), table.get("distortion", [])
+        )
     except LiexError as error:
         raise RecordingError(f"{path}: {error}") from None
-
-
-def _number(path: Path, key: str, value: Any, finite: bool = True) -> float:
-    good = isinstance(value, int | float) and not isinstance(value, bool)
-    if not good or (finite and not math.isfinite(value)):
-        raise RecordingError(
-            f"{path} states {key} = {value!r} where a number was expected; correct it"
-        )
-    return float(value)
+    same = ("byte_order", "time_column", "time_unit", "encoding", "timestamps", "pattern")
+    return CameraFile(
+        path=path,
+        intrinsics={key: float(table[key]) for key in _INTRINSICS if key in table},
+        width=int(table["width"]) if "width" in table else None,
+        height=int(table["height"]) if "height" in table else None,
+        unit_mm=float(table.get("unit_mm", ENCODINGS[table.get("encoding", "linear")])),
+        states_unit="unit_mm" in table,
+        unread=tuple(map(float, unread if isinstance(unread, list) else [unread])),
+        fps=rate(float(table["fps"]) if "fps" in table else None, str(path)),
+        metadata=metadata,
+        problems=problems,
+        distortion=distortion,
+        **{key: table[key] for key in same if key in table},
+    )
 
 
 # Infrared images, recognised by name: 16-bit brightness that could be mistaken for depth.

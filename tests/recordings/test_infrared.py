@@ -8,9 +8,8 @@ import av
 import numpy as np
 import pytest
 
-from liex_lab.recordings import open_recording
 from liex_lab.recordings.camera_file import is_infrared
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, facts_in, refusal
 from tests.recordings.video_writers import write_avi, write_mkv
 from tests.recordings.writers import SMALL, depth_frames, even_times, write_png_folder
 
@@ -95,8 +94,7 @@ def test_a_video_called_infrared_is_refused_also_alone_in_a_folder(
         assert "holds infrared" in refusal(given, camera=SMALL)
     for other in ("circle", "first", "birdie"):
         path = path.rename(path.with_stem(other))
-        with open_recording(path, camera=SMALL) as recording:
-            np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
+        np.testing.assert_array_equal(depths_in(path, camera=SMALL)[2], STORED[2])
 
 
 @pytest.mark.parametrize("title", ["IR", "INFRARED", "PASSIVE_IR", "Infrared 1"])
@@ -114,16 +112,14 @@ def test_depth_is_taken_wherever_it_stands(tmp_path: Path, titles: tuple[str, ..
         write_mkv(tmp_path / "mouse_ir.mkv", STORED, titles=titles),
         write_titled_avi(tmp_path / "mouse.avi", titles),
     ):
-        with open_recording(path, camera=SMALL) as recording:
-            np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
+        np.testing.assert_array_equal(depths_in(path, camera=SMALL)[2], STORED[2])
 
 
 def test_of_untitled_tracks_the_first_is_taken_as_the_azure_recorder_writes_them(
     tmp_path: Path,
 ) -> None:
     path = write_mkv(tmp_path / "a.mkv", 2 * STORED, titles=("", ""))
-    with open_recording(path, camera=SMALL) as recording:
-        np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
+    np.testing.assert_array_equal(depths_in(path, camera=SMALL)[2], STORED[2])
 
 
 def test_a_folder_of_infrared_images_is_refused_and_depth_beside_infrared_is_read(
@@ -134,13 +130,11 @@ def test_a_folder_of_infrared_images_is_refused_and_depth_beside_infrared_is_rea
         folder = write_png_folder(tmp_path / name, STORED, SMALL, times)
         assert "holds infrared" in refusal(folder)
     for name in ("circle", "mirror"):
-        with open_recording(write_png_folder(tmp_path / name, STORED, SMALL, times)) as recording:
-            assert len(recording) == len(STORED)
+        assert len(facts_in(write_png_folder(tmp_path / name, STORED, SMALL, times))) == len(STORED)
     both = write_png_folder(tmp_path / "both", STORED, SMALL, times)
     for k, picture in enumerate(sorted(both.glob("*.png"))):
         picture.with_name(f"ir_{k:04d}.png").write_bytes(picture.read_bytes())
-    with open_recording(both) as recording:
-        assert len(recording) == len(STORED)
+    assert len(facts_in(both)) == len(STORED)
     for picture in both.glob("*.png"):
         if not picture.name.startswith("ir"):
             picture.unlink()

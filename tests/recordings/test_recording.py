@@ -18,7 +18,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
 from liex_lab.recordings.frame import depth_mm
 from liex_lab.recordings.recording import file_digest
-from tests.recordings.asking import refusal
+from tests.recordings.asking import facts_in, refusal
 from tests.recordings.writers import (
     SMALL,
     depth_frames,
@@ -298,11 +298,12 @@ def test_a_folder_around_one_file_is_that_file(tmp_path: Path) -> None:
 def test_names_come_from_the_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_png_folder(tmp_path / "m01.day2", FOUR_FRAMES)
     monkeypatch.chdir(folder)
-    with open_recording(".") as recording:
-        assert recording.name == "m01.day2"
+    assert facts_in(".").name == "m01.day2"
     session = write_moseq_folder(tmp_path / "s", depth_frames(1, 512, 424))
-    with open_recording(write_archive(session, tmp_path / "session_20170125.tar.gz")) as recording:
-        assert recording.name == "session_20170125"
+    assert (
+        facts_in(write_archive(session, tmp_path / "session_20170125.tar.gz")).name
+        == "session_20170125"
+    )
 
 
 def test_what_may_not_be_read_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from liex_lab.optics.camera import Distortion
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame, depth_mm, metres, nearest_steps, whole_steps
 from liex_lab.recordings.writer import McapDepthWriter, PictureFolderWriter, RecordingWriter
+from tests.recordings.asking import depths_in, exact
 from tests.recordings.writers import SMALL, START_NS, depth_frames, even_times
 
 STORED = depth_frames(40).astype(np.float32)
@@ -47,11 +48,10 @@ WRITERS: dict[str, Any] = {
 def test_what_is_written_is_read_again(tmp_path: Path, kind: str, start_ns: int) -> None:
     writer = WRITERS[kind](tmp_path)
     assert fill(writer, start_ns=start_ns) == []
-    with open_recording(writer.path, strict=True) as recording:
-        assert recording.problems == []
-        assert recording.times_ns.tolist() == even_times(len(STORED), start_ns)
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
-        assert recording.camera.matrix.tolist() == SMALL.matrix.tolist()
+    recording = exact(writer.path, STORED, strict=True)
+    assert recording.problems == []
+    assert recording.times_ns.tolist() == even_times(len(STORED), start_ns)
+    assert recording.camera.matrix.tolist() == SMALL.matrix.tolist()
 
 
 BENT = [
@@ -143,8 +143,7 @@ def test_depth_between_millimetres_is_metres_in_32_bits(tmp_path: Path) -> None:
     writer = McapDepthWriter(tmp_path / "r.mcap", SMALL)
     (note,) = fill(writer, depths)
     assert "not in whole millimetres" in note
-    with open_recording(writer.path, strict=True) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], depths)
+    np.testing.assert_array_equal(depths_in(writer.path, strict=True), depths)
 
 
 @given(st.lists(st.floats(0, 70_000, width=32), min_size=1, max_size=20))
@@ -189,8 +188,7 @@ def test_pictures_refuse_what_they_do_not_keep_unless_told_to_round(tmp_path: Pa
     (tmp_path / "b").mkdir()
     (note,) = exact_and_not(tmp_path / "b", depths, step_mm=0.5, exact=False)
     assert note == "depth was rounded to whole steps of 0.5 mm"
-    with open_recording(tmp_path / "b" / "r") as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], depths, atol=0.25)
+    np.testing.assert_allclose(depths_in(tmp_path / "b" / "r"), depths, atol=0.25)
     (tmp_path / "c").mkdir()
     with pytest.raises(RecordingError, match="up to 70000 mm"):
         exact_and_not(tmp_path / "c", np.full((1, 48, 64), 70_000, np.float32))

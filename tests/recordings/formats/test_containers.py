@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.formats.messages.mcap import McapFile
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, facts_in, refusal
 from tests.recordings.ros_writers import (
     Info,
     realsense_messages,
@@ -71,11 +71,14 @@ def numbers(lens: Lens) -> tuple[float, ...]:
     return (lens.fx, lens.fy, lens.cx, lens.cy)
 
 
-def is_exact(recording: Recording, step_mm: float = 1.0) -> None:
-    """Times within 1 us, depth to the last step."""
-    assert np.abs(recording.times_ns - np.array(TIMES)).max() <= 1000
-    for frame, stored in zip(recording, STORED, strict=True):
-        np.testing.assert_array_equal(frame.depth, stored.astype(np.float32) * np.float32(step_mm))
+def exact(path: Path, step_mm: float = 1.0, **how: Any) -> Recording:
+    """A recording whose times are right within 1 us and depths to the last step, closed again."""
+    with open_recording(path, **how) as recording:
+        assert np.abs(recording.times_ns - np.array(TIMES)).max() <= 1000
+        for frame, stored in zip(recording, STORED, strict=True):
+            expected = stored.astype(np.float32) * np.float32(step_mm)
+            np.testing.assert_array_equal(frame.depth, expected)
+        return recording
 
 
 def copy_to_mcap(path: Path, db3: Path) -> Path:
@@ -125,12 +128,11 @@ def test_a_realsense_recording_needs_no_file_of_ones_own(
     path = write_db3(tmp_path / "r", STORED, messages=messages, packed=container == "packed db3")
     if container.startswith("mcap"):
         path = copy_to_mcap(tmp_path / "r.mcap", path)
-    with open_recording(path, strict=container == "mcap by index") as recording:
-        assert numbers(recording.camera) == numbers(QVGA)
-        assert recording.camera.distortion is None
-        is_exact(recording, float(unit) * 1000)
-        assert recording.problems == []
-        assert recording.metadata["session_start_time"].startswith("2025-10-09")
+    recording = exact(path, float(unit) * 1000, strict=container == "mcap by index")
+    assert numbers(recording.camera) == numbers(QVGA)
+    assert recording.camera.distortion is None
+    assert recording.problems == []
+    assert recording.metadata["session_start_time"].startswith("2025-10-09")
 
 
 def test_a_hardware_clock_starts_when_the_computer_says(tmp_path: Path) -> None:
@@ -145,40 +147,32 @@ def test_frames_without_metadata_have_their_time_of_arrival_and_that_is_said(
     tmp_path: Path,
 ) -> None:
     messages = realsense_messages(STORED, QVGA, TIMES, without_metadata=(2, 5))
-    with open_recording(write_db3(tmp_path / "r", STORED, messages=messages)) as recording:
-        is_exact(recording, 0.5)
-        assert any("2 of 8 depth images have no metadata" in said for said in recording.problems)
+    problems = exact(write_db3(tmp_path / "r", STORED, messages=messages), 0.5).problems
+    assert any("2 of 8 depth images have no metadata" in problem for problem in problems)
 
 
 def test_units_that_disagree_are_doubted_until_one_is_stated(tmp_path: Path) -> None:
     messages = realsense_messages(STORED, QVGA, TIMES, option_m="0.001000", metadata_m="0.000250")
     path = write_db3(tmp_path / "r", STORED, messages=messages)
-    with open_recording(path) as recording:
-        assert "depth units of 0.25 and 1 mm" in recording.doubts[0]
-        is_exact(recording, 0.25)
+    assert "depth units of 0.25 and 1 mm" in exact(path, 0.25).doubts[0]
     (tmp_path / "r" / "camera.toml").write_text("[camera]\nunit_mm = 1.0\n")
-    with open_recording(path) as recording:
-        assert recording.doubts == []
-        is_exact(recording, 1.0)
+    assert exact(path, 1.0).doubts == []
 
 
 def test_a_unit_that_nothing_states_is_said_to_be_assumed(tmp_path: Path) -> None:
     messages = realsense_messages(STORED, QVGA, TIMES, option_m=None, metadata_m=None)
     path = write_db3(tmp_path / "r", STORED, messages=messages)
-    with open_recording(path) as recording:
-        assert "states no depth unit" in recording.problems[0]
+    assert "states no depth unit" in facts_in(path).problems[0]
     (tmp_path / "r" / "camera.toml").write_text("[camera]\nunit_mm = 0.5\n")
-    with open_recording(path) as recording:
-        is_exact(recording, 0.5)
+    exact(path, 0.5)
 
 
 def test_a_copied_unit_of_one_does_not_change_what_the_recording_states(tmp_path: Path) -> None:
     """Such a camera.toml beside a recording with its unit was read rightly before, too."""
     path = write_db3(tmp_path / "r", STORED, messages=realsense_messages(STORED, QVGA, TIMES))
     write_camera(tmp_path / "r", QVGA, unit_mm=1.0)
-    with open_recording(path) as recording:
-        is_exact(recording, 0.5)
-        assert any("unit_mm = 1 in camera.toml is not used" in said for said in recording.problems)
+    problems = exact(path, 0.5).problems
+    assert any("unit_mm = 1 in camera.toml is not used" in problem for problem in problems)
 
 
 # calibrations
@@ -203,10 +197,9 @@ def test_right_calibrations_after_a_wrong_one_are_used(
     write: Writer, first: Info, strict: bool
 ) -> None:
     later = [Info(QVGA, at=k) for k in range(1, len(STORED))]
-    with open_recording(write(infos=[first, *later]), strict=strict) as recording:
-        assert numbers(recording.camera) == numbers(QVGA)
-        is_exact(recording)
-        assert recording.doubts == []
+    recording = exact(write(infos=[first, *later]), strict=strict)
+    assert numbers(recording.camera) == numbers(QVGA)
+    assert recording.doubts == []
 
 
 def test_calibrations_without_numbers_are_called_so(write: Writer) -> None:
@@ -270,13 +263,9 @@ def test_the_calibration_of_another_lens_is_doubted(
     write: Writer, topic: str, frame_id: str, info: tuple[str, str], doubted: bool
 ) -> None:
     path = write(topics=(topic,), frame_id=frame_id, infos=[Info(QVGA, *info)])
-    with open_recording(path) as recording:
-        is_exact(recording)
-        assert [doubt[:40] for doubt in recording.doubts] == [
-            "the calibration is that of another lens "
-        ] * doubted
-    with open_recording(path, camera=Lens(280.0, 280.0, 159.0, 119.0)) as recording:
-        assert recording.doubts == []  # what the sentence asks for settles it
+    doubts = [doubt[:40] for doubt in exact(path).doubts]
+    assert doubts == ["the calibration is that of another lens "] * doubted
+    assert facts_in(path, camera=Lens(280.0, 280.0, 159.0, 119.0)).doubts == []
 
 
 @pytest.mark.parametrize(
@@ -310,11 +299,10 @@ def test_the_calibration_of_another_lens_is_doubted(
 def test_parts_and_bins_of_a_picture_are_mapped(write: Writer, info: Info, topic: str) -> None:
     distortion = (0.1, -0.05, 0.001, 0.002, 0.0)
     path = write(topics=(topic,), frame_id="", infos=[info], distortion=distortion)
-    with open_recording(path) as recording:
-        assert numbers(recording.camera) == pytest.approx(numbers(QVGA))
-        assert (recording.camera.distortion is None) == ("rect" in topic)
-        is_exact(recording)
-        assert recording.doubts == []
+    recording = exact(path)
+    assert numbers(recording.camera) == pytest.approx(numbers(QVGA))
+    assert (recording.camera.distortion is None) == ("rect" in topic)
+    assert recording.doubts == []
 
 
 # units
@@ -336,8 +324,7 @@ def test_floats_have_the_unit_that_is_stated(
         beside = path if path.is_dir() else path.parent
         if unit_mm is not None:
             (beside / "camera.toml").write_text(f"[camera]\nunit_mm = {unit_mm}\n")
-        with open_recording(path) as recording:
-            np.testing.assert_allclose(recording.frame(1).depth, STORED[1], rtol=1e-6)
+        np.testing.assert_allclose(depths_in(path)[1], STORED[1], rtol=1e-6)
 
 
 def test_a_converted_recording_beside_its_folder_is_not_scaled_twice(tmp_path: Path) -> None:
@@ -346,8 +333,7 @@ def test_a_converted_recording_beside_its_folder_is_not_scaled_twice(tmp_path: P
     folder = write_png_folder(tmp_path / "r", STORED, QVGA, unit_mm=0.25)
     for name in ("r.mcap", "ros.mcap"):
         convert(folder, folder / name, ros=name == "ros.mcap")
-        with open_recording(folder / name) as recording:
-            is_exact(recording, 0.25)
+        exact(folder / name, 0.25)
 
 
 # packed and differently encoded messages
@@ -361,17 +347,15 @@ def test_messages_that_are_packed_one_by_one_are_read(
     tmp_path: Path, pack: Callable[[bytes], bytes], strict: bool
 ) -> None:
     path = write_ros_mcap(tmp_path / "r.mcap", STORED, camera=QVGA, pack_message=pack)
-    with open_recording(path, strict=strict) as recording:
-        is_exact(recording)
-        assert (recording.truncated, recording.problems) == (False, [])
+    recording = exact(path, strict=strict)
+    assert (recording.truncated, recording.problems) == (False, [])
 
 
 def test_a_bag_whose_messages_rosbag2_packed_is_read(tmp_path: Path) -> None:
     path = write_db3(tmp_path / "r", STORED, camera=QVGA, packed=True)
     assert "compression_mode: message" in (path / "metadata.yaml").read_text()
-    with open_recording(path) as recording:
-        is_exact(recording)
-        assert (recording.truncated, recording.problems) == (False, [])
+    recording = exact(path)
+    assert (recording.truncated, recording.problems) == (False, [])
 
 
 def test_a_message_that_unpacks_to_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
@@ -393,8 +377,7 @@ def test_a_bag_that_is_packed_as_a_whole_names_the_command(tmp_path: Path) -> No
     for given in (packed, folder):
         assert "unpack it with `zstd -d`" in refusal(given)
     plain.write_bytes(content)  # which `zstd -d` does, and keeps the packed one
-    with open_recording(folder) as recording:
-        is_exact(recording)
+    exact(folder)
 
 
 def to_second_version(data: bytes, kind: int = 7) -> bytes:
@@ -411,10 +394,9 @@ def test_the_second_version_of_cdr_is_read(tmp_path: Path) -> None:
             topics=(topic,),
             pack_message=to_second_version,
         )
-        with open_recording(path) as recording:
-            is_exact(recording)
-            assert numbers(recording.camera) == numbers(QVGA)
-            assert (recording.truncated, recording.problems) == (False, [])
+        recording = exact(path)
+        assert numbers(recording.camera) == numbers(QVGA)
+        assert (recording.truncated, recording.problems) == (False, [])
 
 
 def test_numbers_of_the_second_version_are_aligned_to_four_bytes(tmp_path: Path) -> None:
@@ -458,9 +440,7 @@ def test_a_calibration_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         in said
     )
     write_camera(tmp_path, QVGA)
-    with open_recording(path) as recording:
-        assert not recording.truncated
-        is_exact(recording)
+    assert not exact(path).truncated
 
 
 def test_rows_whose_step_counts_pixels_are_read(tmp_path: Path) -> None:
@@ -471,8 +451,7 @@ def test_rows_whose_step_counts_pixels_are_read(tmp_path: Path) -> None:
         camera=QVGA,
         pack_message=lambda data: data.replace(pixels, struct.pack("<I", 320), 1),
     )
-    with open_recording(path) as recording:
-        is_exact(recording)
+    exact(path)
 
 
 def test_a_picture_that_lacks_rows_says_what_it_states(tmp_path: Path) -> None:
@@ -531,9 +510,8 @@ def test_dates_in_json_are_stamps(tmp_path: Path) -> None:
         stamps[n] = stamp.ToJsonString()
     stamps[1] = stamps[1].replace("Z", "+00:00")
     late = [ns + 5_000_000 * (n % 3) for n, ns in enumerate(TIMES)]
-    with open_recording(write_json(tmp_path / "r.mcap", stamps, log_ns=late)) as recording:
-        is_exact(recording)
-        assert (recording.truncated, recording.problems) == (False, [])
+    recording = exact(write_json(tmp_path / "r.mcap", stamps, log_ns=late))
+    assert (recording.truncated, recording.problems) == (False, [])
 
 
 # clocks and orders
@@ -548,13 +526,9 @@ def test_pictures_without_stamps_have_the_times_of_sending_where_logging_is_burs
         tmp_path / "r.mcap", STORED, camera=QVGA, stamped=False, log_ns=bursts, sent_ns=TIMES
     )
     for path in (ros, write_json(tmp_path / "j.mcap", {}, log_ns=bursts)):
-        with open_recording(path, strict=strict) as recording:
-            is_exact(recording)
-            assert "so the times of sending are used" in recording.problems[0]
+        assert "so the times of sending are used" in exact(path, strict=strict).problems[0]
     steady = write_json(tmp_path / "j.mcap", {}, sent_ns=bursts)
-    with open_recording(steady, strict=strict) as recording:
-        is_exact(recording)
-        assert "so the times of logging are used" in recording.problems[0]
+    assert "so the times of logging are used" in exact(steady, strict=strict).problems[0]
 
 
 MANY = depth_frames(60)

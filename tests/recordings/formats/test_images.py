@@ -19,7 +19,7 @@ from liex_lab.recordings.formats.images.files import read_pclzf_camera
 from liex_lab.recordings.formats.images.folder import natural_key
 from liex_lab.recordings.frame import ENCODINGS, decode
 from tests.oracles import lzf
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, facts_in, refusal
 from tests.recordings.picture_writers import pack_lzf, write_folder, write_pclzf, write_pgm
 from tests.recordings.writers import (
     SMALL,
@@ -49,10 +49,7 @@ def test_pictures_are_in_the_order_a_person_would_count_them(tmp_path: Path) -> 
 def test_units_and_unread_values_are_as_stated(tmp_path: Path) -> None:
     stored = np.full((2, 48, 64), 5000, np.uint16)
     stored[:, 0, 0], stored[:, 0, 1] = 65535, 0
-    with open_recording(
-        write_png_folder(tmp_path / "r", stored, unit_mm=0.2, unread=[0, 65535])
-    ) as recording:
-        depth = recording.frame(0).depth
+    depth = depths_in(write_png_folder(tmp_path / "r", stored, unit_mm=0.2, unread=[0, 65535]))[0]
     assert depth[1, 1] == 1000.0
     np.testing.assert_array_equal(depth[0, :3], [0.0, 0.0, 1000.0])
 
@@ -87,8 +84,7 @@ def test_without_stamps_a_stated_rate_is_used_and_told(tmp_path: Path) -> None:
         assert recording.rate_hz == pytest.approx(25)
         assert any("25 frames/s was assumed" in problem for problem in recording.problems)
     write_camera(folder, SMALL, fps=50)
-    with open_recording(folder) as recording:
-        assert recording.rate_hz == pytest.approx(50)
+    assert facts_in(folder).rate_hz == pytest.approx(50)
     assert "fps = -1" in refusal(folder, fps=-1)
     assert "fps = nan" in refusal(folder, fps=float("nan"))
 
@@ -99,8 +95,7 @@ def test_a_stated_camera_needs_no_camera_file(tmp_path: Path) -> None:
     sentence = refusal(folder)
     for word in ("camera.toml", "fx", "fy", "cx", "cy", "unit_mm"):
         assert word in sentence
-    with open_recording(folder, camera=SMALL) as recording:
-        assert recording.camera == SMALL
+    assert facts_in(folder, camera=SMALL).camera == SMALL
     assert "640 x 480" in refusal(folder, camera=Camera(500, 500, 320, 240, 640, 480))
 
 
@@ -110,8 +105,7 @@ def test_counts_that_differ_are_told_and_the_smaller_is_used(tmp_path: Path) -> 
         assert (len(recording), recording.truncated) == (9, False)
         assert any("12 frames" in p and "9 time stamps" in p for p in recording.problems)
     write_times(folder, even_times(15))
-    with open_recording(folder) as recording:
-        assert len(recording) == 12
+    assert len(facts_in(folder)) == 12
     write_times(folder, [])
     assert "no time stamp" in refusal(folder)
 
@@ -192,8 +186,7 @@ def test_one_colour_picture_among_many_is_found_on_opening(tmp_path: Path) -> No
     cv2.imwrite(str(folder / "frame_7_colour.png"), np.zeros((48, 64, 3), np.uint8))
     assert "frame_7_colour.png" in refusal(folder)
     write_camera(folder, SMALL, pattern="frame_?.png")
-    with open_recording(folder) as recording:
-        assert len(recording) == 10
+    assert len(facts_in(folder)) == 10
     write_camera(folder, SMALL, pattern="depth*")
     assert "'depth*'" in refusal(folder)
 
@@ -213,8 +206,7 @@ def test_other_files_beside_the_pictures_do_not_matter(tmp_path: Path) -> None:
     (folder / "._frame_3.png").write_bytes(b"resource fork")
     (folder / "notes.txt").write_text("hello")
     (folder / "more").mkdir()
-    with open_recording(folder) as recording:
-        assert len(recording) == 12
+    assert len(facts_in(folder)) == 12
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -237,14 +229,14 @@ def test_a_text_that_is_named_like_a_picture_is_refused(tmp_path: Path, suffix: 
         ("[camera]\nfx = 5\nfy = 1\ncx = 1\ncy = 1\nwidth = 64.5", "width = 64.5"),
         ("[camera]\nfx = 5\nfy = 1\ncx = 1\ncy = 1\nunit_mm = 0", "unit_mm = 0"),
         ("[camera]\nfx = 5\nfy = 1\ncx = 1\ncy = 1\nunit_mm = inf", "unit_mm = inf"),
-        ("[camera]\nfx = 5\nfy = 1\ncx = 1\ncy = 1\nunread = ['x']", "unread = 'x'"),
+        ("[camera]\nfx = 5\nfy = 1\ncx = 1\ncy = 1\nunread = ['x']", "unread = ['x']"),
         ("[camera]\nfx = 5\nfy = 1\ncx = 1\ncy = 1\nfps = 0", "fps = 0"),
         ("[camera]\nfx = 5\nfy = 1\ncx = 1\ncy = 1\ntimestamps = 3", "timestamps = 3"),
         ("[camera\nfx = 5", "does not parse"),
         ("", "camera.toml"),
         ("camera = 5", "camera.toml"),
         ("[camera]\nfx = 60\ndistortion = 0.1", "a list of coefficients"),
-        ("[camera]\nfx = 60\ndistortion = [0.1, 'k2']", "where a number was expected"),
+        ("[camera]\nfx = 60\ndistortion = [0.1, 'k2']", "a list of coefficients"),
         (
             "[camera]\nfx = 60\ndistortion = [0.1]\ndistortion_model = 'mei'",
             "'mei' is not supported",
@@ -264,8 +256,7 @@ def test_a_wrong_camera_file_is_told_in_a_sentence(tmp_path: Path, content: str,
 def test_keys_may_stand_without_a_table_and_sizes_may_be_left_out(tmp_path: Path) -> None:
     folder = write_png_folder(tmp_path / "r", STORED[:2])
     (folder / "camera.toml").write_text("fx = 60\nfy = 61.0\ncx = 31.5\ncy = 23.5")
-    with open_recording(folder) as recording:
-        camera = recording.camera
+    camera = facts_in(folder).camera
     assert (camera.fx, camera.cy, camera.width, camera.height, camera.source) == (
         60.0,
         23.5,
@@ -321,8 +312,7 @@ def test_float_tiffs_are_millimetres_and_may_point_the_other_way(tmp_path: Path)
     path = write_tiff_stack(tmp_path / "depth.tif", stored)
     assert "unit_mm = -1" in refusal(path)
     write_camera(tmp_path, SMALL, unit_mm=-1.0)
-    with open_recording(path) as recording:
-        depth = recording.frame(3).depth
+    depth = depths_in(path)[3]
     np.testing.assert_array_equal(depth[0, :2], [0.0, 0.0])
     np.testing.assert_array_equal(depth[1:], -stored[3, 1:])
 
@@ -366,8 +356,7 @@ def test_pgm_is_read_in_the_byte_order_stated_or_plain_to_see(
 
 def test_a_stated_byte_order_is_believed(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "r", PICTURES_STORED, ".pgm", write_pgm, byte_order="little")
-    with open_recording(folder) as recording:
-        np.testing.assert_array_equal(recording.frame(0).depth, PICTURES_STORED[0].byteswap())
+    np.testing.assert_array_equal(depths_in(folder)[0], PICTURES_STORED[0].byteswap())
     write_camera(folder, byte_order="middle")
     assert '"big", "little"' in refusal(folder)
 
@@ -378,8 +367,7 @@ def test_a_stated_byte_order_is_believed(tmp_path: Path) -> None:
 )
 def test_pgm_headers_are_loose(tmp_path: Path, head: str) -> None:
     folder = write_folder(tmp_path / "r", PICTURES_STORED, ".pgm", partial(write_pgm, head=head))
-    with open_recording(folder, strict=True) as recording:
-        np.testing.assert_array_equal(recording.frame(3).depth, PICTURES_STORED[3])
+    np.testing.assert_array_equal(depths_in(folder, strict=True)[3], PICTURES_STORED[3])
 
 
 def test_eight_bit_pgm_is_a_picture_for_people(tmp_path: Path) -> None:
@@ -471,8 +459,7 @@ def test_an_encoding_is_stated_in_camera_toml(tmp_path: Path) -> None:
     folder = write_folder(
         tmp_path / "r", stored, ".png", lambda p, f: cv2.imwrite(str(p), f), encoding="tum"
     )
-    with open_recording(folder) as recording:
-        np.testing.assert_allclose(recording.frame(1).depth, PICTURES_STORED[1], rtol=1e-6)
+    np.testing.assert_allclose(depths_in(folder)[1], PICTURES_STORED[1], rtol=1e-6)
     write_camera(folder, encoding="nyu-hand")
     assert "got a 16-bit grey image" in refusal(folder)
     write_camera(folder, encoding="tumm")
@@ -512,8 +499,7 @@ def test_a_stamp_file_of_another_program_is_read_as_stated(
         for k, t in enumerate(times)
     ]
     (folder / "stamps.txt").write_text("\n".join([*header.splitlines(), *rows]))
-    with open_recording(folder, strict=True) as recording:
-        assert recording.times_ns.tolist() == times
+    assert facts_in(folder, strict=True).times_ns.tolist() == times
 
 
 @pytest.mark.parametrize(
@@ -548,8 +534,7 @@ def test_the_stamps_of_a_file_come_before_those_in_names_and_a_rate(tmp_path: Pa
         ]
         assert recording.metadata["session_start_time"].startswith("2011-05-10T12:38:22.175")
     write_times(folder, even_times(4))
-    with open_recording(folder) as recording:
-        assert recording.times_ns.tolist() == even_times(4)
+    assert facts_in(folder).times_ns.tolist() == even_times(4)
 
 
 # Numbers that depth is stored in: signed, big endian, and the values that mean unread.
@@ -576,8 +561,7 @@ def test_tiff_of_every_kind_gives_the_same_depth(kind: str, compression: str | N
         with tifffile.TiffWriter(path, byteorder=kind[0]) as tif:  # type: ignore[arg-type]
             for page in stored:
                 tif.write(page, photometric="minisblack", compression=compression)
-        with open_recording(path) as recording:
-            np.testing.assert_array_equal([frame.depth for frame in recording], depth)
+        np.testing.assert_array_equal(depths_in(path), depth)
 
 
 @pytest.mark.parametrize(
@@ -602,8 +586,7 @@ def test_the_largest_value_is_a_reading_where_a_step_is_small(tmp_path: Path) ->
     stored[:, 0, 0] = 65535
     for unit_mm, expected in ((0.1, 6553.5), (1.0, 0.0)):
         folder = write_png_folder(tmp_path / f"{unit_mm}", stored, unit_mm=unit_mm)
-        with open_recording(folder) as recording:
-            assert recording.frame(0).depth[0, 0] == pytest.approx(expected)
+        assert depths_in(folder)[0][0, 0] == pytest.approx(expected)
 
 
 def test_signed_depths_that_are_all_negative_are_refused(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from liex_lab.recordings.formats.messages.rosbag import BagFile
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.runtime.progress import silent
-from tests.recordings.asking import opened_or_refused, refusal
+from tests.recordings.asking import depths_in, opened_or_refused, refusal
 from tests.recordings.ros_writers import points_of, write_bag, write_messages, write_ros_mcap
 from tests.recordings.writers import (
     SMALL,
@@ -58,8 +58,7 @@ def path(tmp_path: Path) -> Path:
 def test_floats_are_metres_and_nan_is_unread(path: Path) -> None:
     stored = STORED.astype(np.float32) / 1000
     stored[:, 0, :3] = [np.nan, np.inf, -1.0]
-    with open_recording(write_mcap(path, stored, encoding="32FC1")) as recording:
-        depth = recording.frame(5).depth
+    depth = depths_in(write_mcap(path, stored, encoding="32FC1"))[5]
     np.testing.assert_array_equal(depth[0, :3], 0.0)
     np.testing.assert_allclose(depth[1:], STORED[5, 1:], atol=1e-4)
 
@@ -451,8 +450,9 @@ def test_a_cloud_may_lie_in_a_frame_of_its_own(tmp_path: Path) -> None:
     x, y, z, w = Rotation.from_matrix(T).as_quat().tolist()
     turn = Quaternion(x=x, y=y, z=z, w=w)
     pose = Pose(position=Vector3(x=0.1, y=0.0, z=0.05), orientation=turn)
-    with open_recording(write_clouds(tmp_path / "r.mcap", clouds, pose)) as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], FOXGLOVE_STORED, atol=2e-3)
+    np.testing.assert_allclose(
+        depths_in(write_clouds(tmp_path / "r.mcap", clouds, pose)), FOXGLOVE_STORED, atol=2e-3
+    )
 
 
 @pytest.mark.parametrize("compression", [MCAPCompression.Zstd, MCAPCompression.Lz4, None])

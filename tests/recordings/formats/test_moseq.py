@@ -11,7 +11,7 @@ import pytest
 
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, exact, facts_in, refusal
 from tests.recordings.writers import (
     cut,
     depth_frames,
@@ -70,8 +70,7 @@ def test_another_size_than_the_kinects_is_found_out(tmp_path: Path) -> None:
     write_camera(
         path.parent, Camera(600, 600, 320, 240, 640, 480)
     )  # one file for all the sessions beside it
-    with open_recording(path) as recording:
-        assert recording.camera.fx == 600
+    assert facts_in(path).camera.fx == 600
 
 
 def test_big_endian_depth_is_what_metadata_says(folder: Path) -> None:
@@ -79,8 +78,7 @@ def test_big_endian_depth_is_what_metadata_says(folder: Path) -> None:
     (folder / "metadata.json").write_text(
         json.dumps({"DepthResolution": [64, 48], "IsLittleEndian": False})
     )
-    with open_recording(folder) as recording:
-        np.testing.assert_array_equal(recording.frame(3).depth, STORED[3])
+    np.testing.assert_array_equal(depths_in(folder)[3], STORED[3])
 
 
 def test_without_stamps_the_usual_rate_is_assumed_and_told(folder: Path) -> None:
@@ -88,8 +86,7 @@ def test_without_stamps_the_usual_rate_is_assumed_and_told(folder: Path) -> None
     with open_recording(folder) as recording:
         assert recording.rate_hz == pytest.approx(30)
         assert any("30 frames/s was assumed" in problem for problem in recording.problems)
-    with open_recording(folder, fps=60) as recording:
-        assert recording.rate_hz == pytest.approx(60)
+    assert facts_in(folder, fps=60).rate_hz == pytest.approx(60)
 
 
 @pytest.mark.parametrize(
@@ -178,8 +175,7 @@ def test_what_an_archive_was_unpacked_to_opens_as_the_same_recording(
             for frame in again:
                 np.testing.assert_array_equal(frame.depth, STORED[frame.index])
     write_camera(folder)
-    with open_recording(folder) as session:
-        assert session.unpacked is None
+    assert facts_in(folder).unpacked is None
 
 
 def test_members_may_lie_in_folders_and_a_tar_may_be_unpacked_already(
@@ -200,8 +196,7 @@ def test_names_cannot_lead_out_of_the_cache(folder: Path, tmp_path: Path) -> Non
         link = tarfile.TarInfo("timestamps.csv")
         link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
         tar.addfile(link)
-    with open_recording(path) as recording:
-        assert len(recording) == 20
+    assert len(facts_in(path)) == 20
     assert not (tmp_path.parent / "depth.dat").exists()
 
 
@@ -219,10 +214,9 @@ def test_a_cut_archive_gives_every_whole_frame(
     by_hand = _slow_gunzip(archive)
     at = by_hand.index(b"depth.dat") + 512
     n = min(20, (len(by_hand) - at) // FRAME_BYTES)
-    with open_recording(archive) as recording:
-        assert recording.truncated
-        assert len(recording) == n
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED[:n])
+    recording = exact(archive, STORED[:n])
+    assert recording.truncated
+    assert len(recording) == n
     assert f"{n} whole frame" in refusal(archive, strict=True)
 
 
@@ -235,8 +229,7 @@ def test_an_archive_may_be_several_gzips_one_after_the_other(
     plain = gzip.decompress(write_archive(folder, tmp_path / "one.tar.gz").read_bytes())
     parts = [plain[i : i + 9000] for i in range(0, len(plain), 9000)]
     (tmp_path / "s.tar.gz").write_bytes(b"".join(map(gzip.compress, parts)) + bytes(700))
-    with open_recording(tmp_path / "s.tar.gz", strict=True) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    np.testing.assert_array_equal(depths_in(tmp_path / "s.tar.gz", strict=True), STORED)
 
 
 def test_an_archive_with_a_wrong_checksum_keeps_every_frame_and_is_reported(
@@ -246,9 +239,7 @@ def test_an_archive_with_a_wrong_checksum_keeps_every_frame_and_is_reported(
     content = bytearray(archive.read_bytes())
     content[-8] ^= 1  # gzip ends in a CRC-32 and a size
     archive.write_bytes(content)
-    with open_recording(archive) as recording:
-        assert recording.truncated
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    assert exact(archive, STORED).truncated
 
 
 def _slow_gunzip(archive: Path) -> bytes:

@@ -25,7 +25,7 @@ from liex_lab.recordings.formats.images.nyu import (
     read_nyu_joints,
     uvd_to_mm,
 )
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, refusal
 from tests.recordings.picture_writers import write_nyu
 from tests.recordings.writers import depth_frames, even_times, write_times
 
@@ -56,8 +56,7 @@ def test_the_first_view_is_read_and_its_real_pictures(tmp_path: Path) -> None:
     folder = write_nyu(tmp_path, STORED)
     for name in ("depth_2_0000001.png", "synthdepth_1_0000001.png", "rgb_1_0000001.png"):
         cv2.imwrite(str(folder / name), np.full((48, 64, 3), 9, np.uint8))
-    with open_recording(folder) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    np.testing.assert_array_equal(depths_in(folder), STORED)
 
 
 def test_sixteen_bit_pictures_of_that_name_are_pictures(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings import Recording, open_recording
 from liex_lab.recordings.depth_kernels import unpack_16z
 from tests.oracles.oni import unpack_frame
-from tests.recordings.asking import opened_or_refused, refusal
+from tests.recordings.asking import depths_in, exact, facts_in, opened_or_refused, refusal
 from tests.recordings.oni_files import (
     COLOUR,
     DEPTH,
@@ -125,9 +125,7 @@ def test_the_depth_node_is_chosen_by_its_kind_and_not_by_its_name(path: Path) ->
         made.frame(4, 1000 * k, payload)
         made.frame(3, 1000 * k, bytes(6144))
     made.write(path)
-    with open_recording(path, strict=True) as recording:
-        assert recording.problems == []
-        assert_frames(recording, STORED)
+    assert exact(path, STORED, strict=True).problems == []
 
 
 def test_of_two_depth_cameras_the_first_with_frames_is_read_and_it_is_told(path: Path) -> None:
@@ -140,11 +138,9 @@ def test_of_two_depth_cameras_the_first_with_frames_is_read_and_it_is_told(path:
         made.frame(3, 1000 * k, bytes(6144))
         made.frame(2, 1000 * k, STORED[k].tobytes())
     made.write(path)
-    with open_recording(path) as recording:
-        assert_frames(recording, STORED)
-        assert recording.problems == [
-            "r.oni holds frames of 2 depth cameras; those of the first, Depth1, are read"
-        ]
+    assert exact(path, STORED).problems == [
+        "r.oni holds frames of 2 depth cameras; those of the first, Depth1, are read"
+    ]
 
 
 # the camera
@@ -207,8 +203,7 @@ def test_where_nothing_is_stated_a_typical_camera_is_taken_and_it_is_told(path: 
 )
 def test_a_field_of_view_that_cannot_be_is_not_taken(path: Path, fov: tuple[float, float]) -> None:
     assert "camera.toml" in refusal(lens_file(path, fov=fov))
-    with open_recording(path, camera=SMALL) as recording:
-        assert recording.camera == SMALL
+    assert facts_in(path, camera=SMALL).camera == SMALL
 
 
 def test_a_stated_camera_and_a_camera_toml_come_before_the_file(path: Path) -> None:
@@ -216,8 +211,7 @@ def test_a_stated_camera_and_a_camera_toml_come_before_the_file(path: Path) -> N
     write_camera(path.parent)
     with open_recording(path) as recording:
         assert (recording.camera.fx, recording.camera.source) == (SMALL.fx, "camera.toml")
-    with open_recording(path, camera=Lens(50, 51, 31, 23)) as recording:
-        assert recording.camera == Camera(50, 51, 31, 23, 64, 48)
+    assert facts_in(path, camera=Lens(50, 51, 31, 23)).camera == Camera(50, 51, 31, 23, 64, 48)
     assert "64 x 48" in refusal(path, camera=Camera(500, 500, 320, 240, 640, 480))
 
 
@@ -254,12 +248,11 @@ def test_a_cropped_frame_lies_in_its_place_of_the_whole_picture(path: Path) -> N
     looks_file(path, [({"xnCropping": cropping(5, 10, 40, 20)}, {}, frame) for frame in part])
     expected = np.zeros_like(STORED)
     expected[:, 10:30, 5:45] = part
-    with open_recording(path) as recording:
-        assert_frames(recording, expected)
-        assert (recording.camera.cx, recording.camera.cy) == (32, 24)
-        assert recording.problems == [
-            "the camera recorded only 40 x 20 pixels at (5, 10) of its 64 x 48; the rest is unread"
-        ]
+    recording = exact(path, expected)
+    assert (recording.camera.cx, recording.camera.cy) == (32, 24)
+    assert recording.problems == [
+        "the camera recorded only 40 x 20 pixels at (5, 10) of its 64 x 48; the rest is unread"
+    ]
 
 
 def test_cropping_may_change_and_end(path: Path) -> None:
@@ -274,11 +267,9 @@ def test_cropping_may_change_and_end(path: Path) -> None:
     )
     expected = STORED[:4].copy()
     expected[1, 20:], expected[1, :, 40:], expected[2] = 0, 0, 0
-    with open_recording(path) as recording:
-        assert_frames(recording, expected)
-        assert recording.problems == [
-            "frame 2 is damaged or not of 64 x 48 pixels, and was taken as wholly unread"
-        ]
+    assert exact(path, expected).problems == [
+        "frame 2 is damaged or not of 64 x 48 pixels, and was taken as wholly unread"
+    ]
 
 
 def test_frames_of_another_size_or_unit_are_unread_and_told(path: Path) -> None:
@@ -290,24 +281,24 @@ def test_frames_of_another_size_or_unit_are_unread_and_told(path: Path) -> None:
             ({}, {"oniPixelFormat": 101}, STORED[4]),
         ],
     )
-    with open_recording(path) as recording:
-        assert_frames(recording, np.stack([np.zeros((48, 64)), *STORED[1:4], np.zeros((48, 64))]))
-        assert recording.problems[0].startswith(
-            "2 of 5 frames have another size or unit than 64 x 48"
-        )
+    assert (
+        exact(path, np.stack([np.zeros((48, 64)), *STORED[1:4], np.zeros((48, 64))]))
+        .problems[0]
+        .startswith("2 of 5 frames have another size or unit than 64 x 48")
+    )
 
 
 def test_depth_in_tenths_of_a_millimetre(path: Path) -> None:
     looks_file(path, [({}, {"oniPixelFormat": 101}, frame) for frame in STORED])
-    with open_recording(path) as recording:
-        assert_frames(recording, STORED.astype(np.float32) * np.float32(0.1))
+    expected = STORED.astype(np.float32) * np.float32(0.1)
+    np.testing.assert_array_equal(depths_in(path), expected)
 
 
 def test_a_camera_toml_may_state_values_that_mean_no_reading(path: Path) -> None:
     depth_builder(payloads("16zT"), "16zT").write(path)
     write_camera(path.parent, unread=[700], unit_mm=2.0)
-    with open_recording(path) as recording:
-        assert_frames(recording, np.where(STORED == 700, 0, 2 * STORED.astype(np.float32)))
+    expected = np.where(STORED == 700, 0, 2 * STORED.astype(np.float32))
+    np.testing.assert_array_equal(depths_in(path), expected)
 
 
 # time
@@ -352,8 +343,7 @@ def test_a_clock_that_stood_still_gives_way_to_a_rate(path: Path) -> None:
     with open_recording(path) as recording:
         assert recording.rate_hz == pytest.approx(30)
         assert "30 frames/s was assumed" in recording.problems[0]
-    with open_recording(path, fps=60) as recording:
-        assert recording.rate_hz == pytest.approx(60)
+    assert facts_in(path, fps=60).rate_hz == pytest.approx(60)
 
 
 # what cannot be read
@@ -361,9 +351,8 @@ def test_a_clock_that_stood_still_gives_way_to_a_rate(path: Path) -> None:
 
 def test_a_file_that_was_never_closed_gives_its_frames(path: Path) -> None:
     depth_builder(payloads("16zT"), "16zT", closed=False).write(path, closed=False)
-    with open_recording(path) as recording:
-        assert (recording.truncated, recording.n_whole) == (True, 9)
-        assert_frames(recording, STORED)
+    recording = exact(path, STORED)
+    assert (recording.truncated, recording.n_whole) == (True, 9)
     assert "9 whole frames" in refusal(path, strict=True)
 
 

@@ -16,7 +16,7 @@ from liex_lab.recordings.formats.images.raytrix import (
     Profile,
     shipped_profiles,
 )
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, facts_in, refusal
 from tests.recordings.picture_writers import (
     points_of,
     write_folder,
@@ -80,8 +80,7 @@ def test_sixteen_bits_are_ten_micrometres(tmp_path: Path) -> None:
     stored = (STORED[:, :, :] * 35).astype(np.uint16)  # around 245 mm
     stored[:, 0, 0], stored[:, 0, 1] = 65535, 65530  # unread, and farther than any tank
     folder = write_raytrix(tmp_path, stored, "raytrix-u16-10um", ".png", png)
-    with open_recording(folder) as recording:
-        depth = recording.frame(1).depth
+    depth = depths_in(folder)[1]
     np.testing.assert_array_equal(depth[0, :2], [0.0, 0.0])
     np.testing.assert_allclose(depth[1:], stored[1, 1:] * 0.01, rtol=1e-6)
 
@@ -133,8 +132,7 @@ def test_a_profile_may_be_stated_in_full_and_a_part_of_one_is_not_enough(tmp_pat
         f"{key} = {str(value) if key == 'invalid' else repr(value)}" for key, value in table.items()
     ]
     (folder / "raytrix.toml").write_text("\n".join(lines))
-    with open_recording(folder) as recording:
-        np.testing.assert_array_equal(recording.frame(1).depth, STORED[1])
+    np.testing.assert_array_equal(depths_in(folder)[1], STORED[1])
 
 
 def test_false_colours_are_refused(tmp_path: Path) -> None:
@@ -162,8 +160,7 @@ def test_exports_without_a_profile_say_what_to_write(tmp_path: Path) -> None:
 def test_the_intrinsics_may_follow_from_the_lens_and_say_so(tmp_path: Path) -> None:
     lens = "focal_mm = 35.0\npitch_mm = 0.0055\n"
     folder = write_raytrix(tmp_path, FLOAT, "raytrix-f32-negative-mm", ".tif", write_tiff, lens)
-    with open_recording(folder) as recording:
-        assert recording.camera.source == "camera.toml"  # measured numbers come first
+    assert facts_in(folder).camera.source == "camera.toml"
     (folder / "camera.toml").unlink()
     with open_recording(folder) as recording:
         camera = recording.camera
@@ -194,8 +191,7 @@ def test_virtual_depth_with_a_calibration_obeys_the_thin_lens(tmp_path: Path, ra
         + 'virtual = "raw"\n' * raw
     )
     folder = write_raytrix(tmp_path, stored, "raytrix-virtual", ".tif", write_tiff, more)
-    with open_recording(folder) as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], STORED, rtol=2e-4)
+    np.testing.assert_allclose(depths_in(folder), STORED, rtol=2e-4)
 
 
 XYZ: list[dict[str, Any]] = [
@@ -209,8 +205,7 @@ XYZ: list[dict[str, Any]] = [
 @pytest.mark.parametrize("how", XYZ)
 def test_points_as_text_are_seen_by_the_camera(tmp_path: Path, how: dict[str, Any]) -> None:
     folder = write_raytrix(tmp_path, STORED, "raytrix-points-mm", ".xyz", partial(write_xyz, **how))
-    with open_recording(folder, strict=True) as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-3)
+    np.testing.assert_allclose(depths_in(folder, strict=True), STORED, atol=1e-3)
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
@@ -218,8 +213,7 @@ def test_points_as_ply_are_seen_by_the_camera(tmp_path: Path, form: str) -> None
     folder = write_raytrix(
         tmp_path, STORED, "raytrix-points-mm", ".ply", partial(write_ply, form=form)
     )
-    with open_recording(folder, strict=True) as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-3)
+    np.testing.assert_allclose(depths_in(folder, strict=True), STORED, atol=1e-3)
 
 
 def test_the_nearest_point_in_a_pixel_counts_and_axes_are_as_stated(tmp_path: Path) -> None:
@@ -231,8 +225,7 @@ def test_the_nearest_point_in_a_pixel_counts_and_axes_are_as_stated(tmp_path: Pa
 
     more = "unit_mm = 10.0\nsign = 1\nup = false\ncolumns = [3, 2, 1]\n"
     folder = write_raytrix(tmp_path, STORED, "raytrix-points-mm", ".txt", write, more)
-    with open_recording(folder) as recording:
-        np.testing.assert_allclose(recording.frame(0).depth, STORED[0], atol=1e-3)
+    np.testing.assert_allclose(depths_in(folder)[0], STORED[0], atol=1e-3)
 
 
 def test_points_need_a_camera_with_a_size(tmp_path: Path) -> None:
@@ -240,7 +233,6 @@ def test_points_need_a_camera_with_a_size(tmp_path: Path) -> None:
     (folder / "camera.toml").write_text("[camera]\nfx = 60\nfy = 61\ncx = 31.5\ncy = 23.5\n")
     assert "width and height" in refusal(folder)
     wide = Camera(30.0, 30.5, 15.75, 11.75, 32, 24)
-    with open_recording(folder, camera=wide) as recording:
-        assert recording.frame(0).depth.shape == (24, 32)
+    assert depths_in(folder, camera=wide)[0].shape == (24, 32)
     (folder / "raytrix.toml").write_text('profile = "raytrix-points-mm"\npattern = "*.ply"')
     assert "'*.ply'" in refusal(folder, camera=SMALL)

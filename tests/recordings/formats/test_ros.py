@@ -22,7 +22,7 @@ from liex_lab.recordings.formats.messages.parsers import (
     decode_message,
     picture_size,
 )
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, facts_in, refusal
 from tests.recordings.ros_writers import (
     How,
     ros_messages,
@@ -73,10 +73,11 @@ def test_either_byte_order_and_padded_rows(
     write: Writer, frames: Any, big_endian: bool, padding: int
 ) -> None:
     kind = "16UC1" if frames is STORED else "32FC1"
-    with open_recording(
-        write(frames, kind=kind, big_endian=big_endian, padding=padding)
-    ) as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-4)
+    np.testing.assert_allclose(
+        depths_in(write(frames, kind=kind, big_endian=big_endian, padding=padding)),
+        STORED,
+        atol=1e-4,
+    )
 
 
 @pytest.mark.parametrize("kind", ["32FC1 png", "32FC1 rvl"])
@@ -89,13 +90,13 @@ def test_quantised_inverse_depth_is_metres_again(write: Writer, kind: str) -> No
 
 @pytest.mark.parametrize("big_endian", [False, True])
 def test_points_in_rows_are_a_depth_picture(write: Writer, big_endian: bool) -> None:
-    with open_recording(write(kind="cloud", big_endian=big_endian, padding=8)) as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-3)
+    np.testing.assert_allclose(
+        depths_in(write(kind="cloud", big_endian=big_endian, padding=8)), STORED, atol=1e-3
+    )
 
 
 def test_loose_points_are_seen_through_the_lens(write: Writer) -> None:
-    with open_recording(write(kind="loose cloud")) as recording:
-        np.testing.assert_allclose([frame.depth for frame in recording], STORED, atol=1e-3)
+    np.testing.assert_allclose(depths_in(write(kind="loose cloud")), STORED, atol=1e-3)
 
 
 def test_of_two_points_on_a_pixel_the_nearer_is_seen(tmp_path: Path) -> None:
@@ -103,8 +104,7 @@ def test_of_two_points_on_a_pixel_the_nearer_is_seen(tmp_path: Path) -> None:
     far[0, ::2, ::2] = 600
     fine = Camera(120.0, 122.0, 63.25, 47.25, 128, 96)
     path = write_ros_mcap(tmp_path / "r.mcap", far, kind="loose cloud", camera=fine)
-    with open_recording(path, camera=Camera(60.0, 61.0, 31.5, 23.5, 64, 48)) as recording:
-        depth = recording.frame(0).depth
+    depth = depths_in(path, camera=Camera(60.0, 61.0, 31.5, 23.5, 64, 48))[0]
     assert set(np.unique(depth.round())) <= {0.0, 600.0, 900.0}
     assert (depth.round() == 600).mean() > 0.9
 
@@ -113,8 +113,7 @@ def test_loose_points_need_a_picture_to_be_seen_in(write: Writer) -> None:
     path = write(kind="loose cloud", calibrated=False)
     assert "write a camera.toml" in refusal(path)
     assert "lie in no image" in refusal(path, camera=Lens(60.0, 61.0, 31.5, 23.5))
-    with open_recording(path, camera=SMALL) as recording:
-        np.testing.assert_allclose(recording.frame(0).depth, STORED[0], atol=1e-3)
+    np.testing.assert_allclose(depths_in(path, camera=SMALL)[0], STORED[0], atol=1e-3)
 
 
 def test_images_come_before_the_clouds_made_of_them(tmp_path: Path) -> None:
@@ -125,20 +124,18 @@ def test_images_come_before_the_clouds_made_of_them(tmp_path: Path) -> None:
         for topic, log_ns, message in ros_messages(2, STORED, how)
     )
     path = write_messages(tmp_path / "r.mcap", messages)
-    with open_recording(path) as recording:
-        np.testing.assert_array_equal(recording.frame(2).depth, STORED[2])
-    with open_recording(path, topic="/camera/points") as recording:
-        np.testing.assert_allclose(recording.frame(2).depth, STORED[2], atol=1e-3)
+    np.testing.assert_array_equal(depths_in(path)[2], STORED[2])
+    np.testing.assert_allclose(depths_in(path, topic="/camera/points")[2], STORED[2], atol=1e-3)
 
 
 def test_infrared_is_not_taken_for_depth(write: Writer) -> None:
     path = write(
         kind="mono16", topics=("/camera/infra1/image_rect_raw", "/camera/depth/image_rect_raw")
     )
-    with open_recording(path) as recording:
-        assert recording.camera.source.endswith("/camera/depth/camera_info")
-    with open_recording(path, topic="/camera/infra1/image_rect_raw") as recording:
-        assert recording.camera.source.endswith("/camera/infra1/camera_info")
+    assert facts_in(path).camera.source.endswith("/camera/depth/camera_info")
+    assert facts_in(path, topic="/camera/infra1/image_rect_raw").camera.source.endswith(
+        "/camera/infra1/camera_info"
+    )
 
 
 def test_several_depth_topics_are_named_and_one_is_chosen(write: Writer) -> None:
@@ -161,10 +158,10 @@ def test_distortion_belongs_to_the_camera_unless_the_picture_is_straightened(wri
     path = write(
         distortion=(0.1, 0.0, 0.0, 0.0, 0.0), topics=("/d/image_raw", "/straight/image_rect_raw")
     )
-    with open_recording(path, topic="/d/image_raw") as recording:
-        assert recording.camera.distortion == Distortion.of("plumb_bob", [0.1])
-    with open_recording(path, topic="/straight/image_rect_raw") as recording:
-        assert recording.camera.distortion is None
+    assert facts_in(path, topic="/d/image_raw").camera.distortion == Distortion.of(
+        "plumb_bob", [0.1]
+    )
+    assert facts_in(path, topic="/straight/image_rect_raw").camera.distortion is None
 
 
 def test_points_are_straight_already(write: Writer) -> None:
@@ -203,8 +200,7 @@ def test_a_realsense_recording_states_its_unit(
 ) -> None:
     topic = "/device_0/sensor_0/Depth_0/image/data"
     path = write_bag(tmp_path / "r.bag", STORED, kind="mono16", topics=(topic,), unit_m=unit_m)
-    with open_recording(path) as recording:
-        np.testing.assert_allclose(recording.frame(1).depth, STORED[1] * step_mm, rtol=1e-6)
+    np.testing.assert_allclose(depths_in(path)[1], STORED[1] * step_mm, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -234,8 +230,7 @@ def test_an_encrypted_bag_is_told(tmp_path: Path) -> None:
 
 def test_log_times_are_whole_nanoseconds(write: Writer) -> None:
     times = [START_NS + k * 33_333_333 + (k % 3) for k in range(len(STORED))]
-    with open_recording(write(times_ns=times)) as recording:
-        assert recording.times_ns.tolist() == times
+    assert facts_in(write(times_ns=times)).times_ns.tolist() == times
 
 
 # Sizes that cannot be, in every kind of message: no image, and no memory asked for.

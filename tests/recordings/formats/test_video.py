@@ -17,7 +17,7 @@ from liex_lab.recordings.formats.moseq import MODES, read_calibration
 from liex_lab.recordings.formats.video import DepthVideo, slices_agree
 from liex_lab.runtime.progress import silent
 from tests.oracles import ffv1
-from tests.recordings.asking import refusal
+from tests.recordings.asking import depths_in, facts_in, refusal
 from tests.recordings.video_writers import (
     even_ms,
     factory_calibration,
@@ -69,8 +69,7 @@ def test_opencv_writes_what_is_read(tmp_path: Path) -> None:
     for frame in STORED:
         writer.write(frame)
     writer.release()
-    with open_recording(tmp_path, camera=SMALL) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    np.testing.assert_array_equal(depths_in(tmp_path, camera=SMALL), STORED)
 
 
 @given(st.binary(min_size=1, max_size=200), st.booleans())
@@ -101,17 +100,13 @@ def test_a_damaged_picture_costs_those_that_build_on_it_and_no_others(tmp_path: 
 
 def test_a_recorder_that_was_stopped_leaves_a_file_that_reads(tmp_path: Path) -> None:
     folder = write_video_session(tmp_path / "mkv", STORED, "depth.mkv", live=True, groups=True)
-    with open_recording(
-        folder, strict=True
-    ) as recording:  # of open size: nothing says that anything is missing
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    np.testing.assert_array_equal(depths_in(folder, strict=True), STORED)
     content = bytearray(write_avi(tmp_path / "a.avi", STORED).read_bytes())
     for name in (b"RIFF", b"movi"):  # the lengths that are filled in at the end, and the index
         at = content.index(name) + (4 if name == b"RIFF" else -4)
         content[at : at + 4] = bytes(4)
     (tmp_path / "a.avi").write_bytes(content[: content.index(b"idx1")])
-    with open_recording(tmp_path / "a.avi", camera=SMALL) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    np.testing.assert_array_equal(depths_in(tmp_path / "a.avi", camera=SMALL), STORED)
 
 
 def test_an_avi_of_more_than_a_gigabyte_goes_on_in_a_second_part(tmp_path: Path) -> None:
@@ -125,15 +120,13 @@ def test_an_avi_of_more_than_a_gigabyte_goes_on_in_a_second_part(tmp_path: Path)
     first = content[: start - 8] + (4 + at - start).to_bytes(4, "little") + content[start - 4 : at]
     first = first[:4] + (len(first) - 8).to_bytes(4, "little") + first[8:]
     (tmp_path / "depth.avi").write_bytes(first + b"RIFF" + len(more).to_bytes(4, "little") + more)
-    with open_recording(tmp_path, camera=SMALL, strict=True) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], STORED)
+    np.testing.assert_array_equal(depths_in(tmp_path, camera=SMALL, strict=True), STORED)
 
 
 def test_stamps_beside_a_video_come_first_and_a_mkv_has_its_own(tmp_path: Path) -> None:
     times = [k * 33 + 100 * (k > 10) for k in range(30)]
     folder = write_video_session(tmp_path, STORED, "depth.mkv", times_ms=times)
-    with open_recording(folder) as recording:
-        assert recording.times_ns[0] == 1_000_000_000  # of depth_ts.txt
+    assert facts_in(folder).times_ns[0] == 1_000_000_000
     (folder / "depth_ts.txt").write_text("1.0 0\n2.0 0\n")
     with open_recording(folder) as recording:
         assert recording.times_ns.tolist() == [t * 10**6 for t in times]
@@ -151,8 +144,7 @@ def test_an_avi_without_stamps_has_a_constant_rate_and_says_so(tmp_path: Path) -
         with open_recording(given_path) as recording:
             assert (recording.name, recording.rate_hz) == ("mouse", 25.0)
             assert any("constant 25 frames/s" in problem for problem in recording.problems)
-    with open_recording(path, fps=50) as recording:
-        assert recording.rate_hz == 50.0
+    assert facts_in(path, fps=50).rate_hz == 50.0
 
 
 @pytest.mark.parametrize("size", MODES, ids=lambda size: MODES[size][0])
@@ -212,8 +204,7 @@ def test_metadata_name_the_camera(tmp_path: Path) -> None:
     (folder / "metadata.json").write_text(
         json.dumps({"DepthResolution": size, "CameraType": "k4a"})
     )
-    with open_recording(folder) as recording:
-        assert recording.camera.source == "typical Azure Kinect, NFOV_UNBINNED"
+    assert facts_in(folder).camera.source == "typical Azure Kinect, NFOV_UNBINNED"
     (folder / "metadata.json").write_text(
         json.dumps({"DepthResolution": [64, 48], "camera": "RealSense D435"})
     )
@@ -225,8 +216,7 @@ def test_metadata_name_the_camera(tmp_path: Path) -> None:
     for camera, known in (("Kinect v2", True), ("RealSense", False), ("azure", False)):
         (kinect / "metadata.json").write_text(json.dumps({"Camera": camera}))
         if known:
-            with open_recording(kinect) as recording:
-                assert recording.camera.source == "typical Kinect v2"
+            assert facts_in(kinect).camera.source == "typical Kinect v2"
         else:
             assert "512 x 424" in refusal(kinect)
 
@@ -242,14 +232,14 @@ def test_the_size_of_a_video_is_its_own(tmp_path: Path) -> None:
 def test_a_day_in_the_file_is_the_day_of_the_recording(tmp_path: Path) -> None:
     folder = write_video_session(tmp_path, STORED, "depth.mkv", date_ns=600_000_000_123_456_000)
     (folder / "metadata.json").unlink()
-    with open_recording(folder) as recording:
-        assert recording.metadata == {"session_start_time": "2020-01-06T10:40:00.123456+00:00"}
+    assert facts_in(folder).metadata == {"session_start_time": "2020-01-06T10:40:00.123456+00:00"}
 
 
 def test_a_video_may_lie_in_an_archive(tmp_path: Path) -> None:
     session = write_video_session(tmp_path / "s", STORED, "depth.mkv")
-    with open_recording(write_archive(session, tmp_path / "s.tar.gz"), strict=True) as recording:
-        np.testing.assert_array_equal(recording.frame(17).depth, STORED[17])
+    np.testing.assert_array_equal(
+        depths_in(write_archive(session, tmp_path / "s.tar.gz"), strict=True)[17], STORED[17]
+    )
 
 
 def test_videos_for_people_are_refused(tmp_path: Path) -> None:
@@ -265,11 +255,9 @@ def test_videos_for_people_are_refused(tmp_path: Path) -> None:
 
 def test_the_depth_is_the_track_that_says_so(tmp_path: Path) -> None:
     path = write_mkv(tmp_path / "a.mkv", STORED, even_ms(30), titles=("IR", "COLOR", "DEPTH"))
-    with open_recording(path, camera=SMALL) as recording:
-        np.testing.assert_array_equal(recording.frame(3).depth, STORED[3])
+    np.testing.assert_array_equal(depths_in(path, camera=SMALL)[3], STORED[3])
     path = write_mkv(tmp_path / "b.mkv", STORED, titles=("first", "second"))
-    with open_recording(path, camera=SMALL) as recording:
-        np.testing.assert_array_equal(recording.frame(3).depth, STORED[3] // 2)
+    np.testing.assert_array_equal(depths_in(path, camera=SMALL)[3], STORED[3] // 2)
     assert "no video track" in refusal(
         write_mkv(tmp_path / "c.mkv", STORED, titles=()), camera=SMALL
     )
