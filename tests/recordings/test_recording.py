@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
-from liex_lab.recordings.frame import depth_mm
+from liex_lab.recordings.frame import depth_mm, has_readings
 from liex_lab.recordings.recording import file_digest
 from tests.recordings.asking import facts_in, refusal
 from tests.recordings.writers import (
@@ -192,6 +192,13 @@ def test_unread_is_told_by_the_stored_value(
     depth = depth_mm(stored, unit, unread)
     assert depth.dtype == np.float32
     np.testing.assert_allclose(depth[0], by_hand, rtol=1e-6)
+
+
+def test_one_reading_anywhere_is_enough() -> None:
+    depth = np.zeros((40, 50), np.float32)
+    assert not has_readings(depth)
+    depth[-1, -3] = 900.0
+    assert has_readings(depth)
 
 
 def test_depth_is_finite_whatever_is_stored() -> None:

@@ -327,21 +327,6 @@ def test_decimal_times_are_exact(tmp_path: Path, text: str, unit: str, ns: int) 
 
 
 @pytest.mark.parametrize(
-    "content",
-    [
-        "time_ns\n5\n7\n",
-        "frame,time_ns\na,5\nb,7\n",
-        'frame;"time_ns"\r\na;5\r\nb;7\r\n',
-        "\ufefftime_s\n0.000000005\n0.000000007\n",
-        "time_ms\n0.000005\n\n0.000007",
-    ],
-)
-def test_a_csv_is_read_whatever_program_wrote_it(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "timestamps.csv"
-    assert times_of(path, content) == [5, 7]
-
-
-@pytest.mark.parametrize(
     ("content", "says"),
     [
         (b"", "missing"),

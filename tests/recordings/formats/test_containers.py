@@ -351,13 +351,6 @@ def test_messages_that_are_packed_one_by_one_are_read(
     assert (recording.truncated, recording.problems) == (False, [])
 
 
-def test_a_bag_whose_messages_rosbag2_packed_is_read(tmp_path: Path) -> None:
-    path = write_db3(tmp_path / "r", STORED, camera=QVGA, packed=True)
-    assert "compression_mode: message" in (path / "metadata.yaml").read_text()
-    recording = exact(path)
-    assert (recording.truncated, recording.problems) == (False, [])
-
-
 def test_a_message_that_unpacks_to_gigabytes_is_not_unpacked(tmp_path: Path) -> None:
     bomb = zstandard.ZstdCompressor().compressobj()
     zeros_of = b"".join(bomb.compress(bytes(1 << 22)) for _ in range(64)) + bomb.flush()

@@ -194,25 +194,20 @@ def test_virtual_depth_with_a_calibration_obeys_the_thin_lens(tmp_path: Path, ra
     np.testing.assert_allclose(depths_in(folder), STORED, rtol=2e-4)
 
 
-XYZ: list[dict[str, Any]] = [
-    {},
-    {"separator": ","},
-    {"separator": "; "},
-    {"separator": "\t", "header": "x\ty\tz"},
-]
-
-
-@pytest.mark.parametrize("how", XYZ)
-def test_points_as_text_are_seen_by_the_camera(tmp_path: Path, how: dict[str, Any]) -> None:
-    folder = write_raytrix(tmp_path, STORED, "raytrix-points-mm", ".xyz", partial(write_xyz, **how))
-    np.testing.assert_allclose(depths_in(folder, strict=True), STORED, atol=1e-3)
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_points_as_ply_are_seen_by_the_camera(tmp_path: Path, form: str) -> None:
-    folder = write_raytrix(
-        tmp_path, STORED, "raytrix-points-mm", ".ply", partial(write_ply, form=form)
-    )
+@pytest.mark.parametrize(
+    ("suffix", "write"),
+    [
+        (".xyz", write_xyz),
+        (".xyz", partial(write_xyz, separator=",")),
+        (".xyz", partial(write_xyz, separator="; ")),
+        (".xyz", partial(write_xyz, separator="\t", header="x\ty\tz")),
+        (".ply", partial(write_ply, form="ascii")),
+        (".ply", partial(write_ply, form="binary_little_endian")),
+        (".ply", partial(write_ply, form="binary_big_endian")),
+    ],
+)
+def test_points_are_seen_by_the_camera(tmp_path: Path, suffix: str, write: Any) -> None:
+    folder = write_raytrix(tmp_path, STORED, "raytrix-points-mm", suffix, write)
     np.testing.assert_allclose(depths_in(folder, strict=True), STORED, atol=1e-3)
 
 
