@@ -222,12 +222,15 @@ class FoxgloveMessages:
     encoding = schema_encoding = "protobuf"
 
     def __init__(self) -> None:
+        from foxglove import messages
         from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
         from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
         from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
         self._types = (RawImage, CompressedImage, CameraCalibration)
-        self.schemas = [_protobuf_schema(message.DESCRIPTOR) for message in self._types]
+        # the SDK states their definitions, but takes no stamp before 1970
+        stated = (messages.RawImage, messages.CompressedImage, messages.CameraCalibration)
+        self.schemas = [(schema.name, schema.data) for schema in (m.get_schema() for m in stated)]
 
     def _message(self, kind: int, time_ns: int, **fields: Any) -> bytes:
         message = self._types[kind](frame_id=FRAME_ID, **fields)
@@ -250,25 +253,6 @@ class FoxgloveMessages:
         model, d = _distortion(camera)
         size = {"width": camera.width, "height": camera.height}
         return self._message(2, time_ns, distortion_model=model, D=d, K=k, R=r, P=p, **size)
-
-
-def _protobuf_schema(descriptor: Any) -> tuple[str, bytes]:
-    """The name and definition of a message with its dependencies."""
-    from google.protobuf.descriptor_pb2 import FileDescriptorSet
-
-    files: dict[str, Any] = {}
-
-    def gather(file: Any) -> None:
-        for needed in file.dependencies:
-            if needed.name not in files:
-                gather(needed)
-        files[file.name] = file
-
-    gather(descriptor.file)
-    whole = FileDescriptorSet()
-    for file in files.values():
-        file.CopyToProto(whole.file.add())
-    return descriptor.full_name, bytes(whole.SerializeToString())
 
 
 _PART = "=" * 80 + "\nMSG: "
@@ -328,32 +312,21 @@ class RosMessages:
     def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
         """sensor_msgs/msg/Image of unpacked pixels, "16UC1" or "32FC1", rows without padding."""
         width, height = size
-        out = _Cdr(time_ns)
-        out.numbers("I", height, width)
-        out.text(encoding)
-        out.numbers("B", 0)  # little endian
-        out.numbers("I", len(data) // height, len(data))
-        return bytes(out.content) + data
+        head = _Cdr(time_ns).numbers("I", height, width).text(encoding).numbers("B", 0)
+        return bytes(head.numbers("I", len(data) // height, len(data)).content) + data
 
     def packed_picture(
         self, time_ns: int, data: bytes, how: str = "16UC1; png compressed "
     ) -> bytes:
         """sensor_msgs/msg/CompressedImage of a 16-bit PNG, or of an image packed otherwise."""
-        out = _Cdr(time_ns)
-        out.text(how)
-        out.numbers("I", len(data))
-        return bytes(out.content) + data
+        return bytes(_Cdr(time_ns).text(how).numbers("I", len(data)).content) + data
 
     def calibration(self, time_ns: int, camera: Camera) -> bytes:
         """sensor_msgs/msg/CameraInfo, with the distortion in ROS's terms."""
-        out = _Cdr(time_ns)
-        out.numbers("I", camera.height, camera.width)
         model, d = _distortion(camera)
-        out.text(model)
-        out.numbers("I", len(d))
-        out.numbers("d", *d, *chain.from_iterable(_matrices(camera)))
-        out.numbers("I", 0, 0, 0, 0, 0, 0)  # not binned, the whole image
-        out.numbers("B", 0)
+        out = _Cdr(time_ns).numbers("I", camera.height, camera.width).text(model)
+        out.numbers("I", len(d)).numbers("d", *d, *chain.from_iterable(_matrices(camera)))
+        out.numbers("I", 0, 0, 0, 0, 0, 0).numbers("B", 0)  # not binned, the whole image
         return bytes(out.content)
 
 
@@ -374,16 +347,17 @@ class _Cdr:
         self.content += struct.pack("<iI", seconds, nanoseconds)
         self.text(FRAME_ID)
 
-    def numbers(self, kind: str, *values: float) -> None:
+    def numbers(self, kind: str, *values: float) -> Self:
         """Append numbers of a type, named as in `struct`."""
         self.content += bytes((4 - len(self.content)) % struct.calcsize(kind))
         self.content += struct.pack(f"<{len(values)}{kind}", *values)
+        return self
 
-    def text(self, text: str) -> None:
+    def text(self, text: str) -> Self:
         """Append a string, preceded by its length and followed by a zero."""
         raw = text.encode() + b"\x00"
-        self.numbers("I", len(raw))
-        self.content += raw
+        self.numbers("I", len(raw)).content += raw
+        return self
 
 
 _CHUNK_BYTES = 128 * 1024  # an image closes its chunk, so that reading one frame unpacks one frame
