@@ -30,7 +30,7 @@ from liex_lab.plan import Plan
 from liex_lab.recordings import Recording, camera_file, open_recording
 from liex_lab.recordings.formats.messages.messages import SUFFIX, PackFacts, hash_note
 from liex_lab.recordings.frame import Depth, region_mask, whole_steps
-from liex_lab.recordings.writer import STAMPS, McapDepthWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import STAMPS, ImageFolderWriter, McapDepthWriter, RecordingWriter
 from liex_lab.runtime import durable
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.zones import Corners
@@ -158,7 +158,7 @@ def _writer(
             f"{target.name} would hold 16-bit images, which do not keep them; write an .mcap file, "
             "which does, or let them be rounded with --step-mm 0.1 (in Python step_mm=0.1)"
         )
-    return PictureFolderWriter(
+    return ImageFolderWriter(
         part, camera, step_mm=step, exact=step_mm is None, metadata=recording.metadata
     )
 

@@ -16,7 +16,7 @@ from liex_lab.errors import LiexError, printable
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.timestamps import unwritable_times
-from liex_lab.recordings.writer import PictureFolderWriter
+from liex_lab.recordings.writer import ImageFolderWriter
 from liex_lab.sessions.corrections import BoutEdit
 from tests.hostile_names import NAMES
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
@@ -55,7 +55,7 @@ def shifted(by_ns: int, folder: Path) -> Path:
     address = "synthetic:walk?seed=3&frames=8&sensor=primesense-qvga&spine_mm=70"
     with (
         open_recording(address) as whole,
-        PictureFolderWriter(folder, whole.camera, step_mm=1.0, exact=False) as written,
+        ImageFolderWriter(folder, whole.camera, step_mm=1.0, exact=False) as written,
     ):
         for frame in whole:
             elapsed = frame.time_ns - int(whole.times_ns[0])

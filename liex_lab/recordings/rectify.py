@@ -44,15 +44,15 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
         "distortion": None if camera.distortion is None else camera.distortion.to_dict(),
         "water": None if water is None else water.to_dict(),
     }
-    seen = recording.seen_by(ideal_camera(camera, water), rectifier(camera, water), optics)
+    view = recording.seen_by(ideal_camera(camera, water), rectifier(camera, water), optics)
     lost = share_lost(camera)
     # share of an image's pixels lost at its edge
     if lost > 0.05:
-        seen.problems.append(
+        view.problems.append(
             f"{lost:.0%} of the pixels leave the image when the lens distortion is undone; keep "
             "the animal away from the image's edge, or check the distortion's coefficients"
         )
-    return seen
+    return view
 
 
 def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
@@ -167,10 +167,10 @@ def lookup_table(camera: Camera) -> NDArray[np.int32]:
         (H', W') int32, row * width + column in the distorted image; -1 if there is none.
     """
     straight = straight_camera(camera)
-    seen = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)
-    inside = _inside(seen, camera)
-    seen = np.where(inside[..., None], seen, 0).astype(np.int32)
-    return np.where(inside, seen[..., 1] * camera.width + seen[..., 0], -1).astype(np.int32)
+    pixels = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)
+    inside = _inside(pixels, camera)
+    pixels = np.where(inside[..., None], pixels, 0).astype(np.int32)
+    return np.where(inside, pixels[..., 1] * camera.width + pixels[..., 0], -1).astype(np.int32)
 
 
 def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:

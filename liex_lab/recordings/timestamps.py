@@ -352,9 +352,9 @@ def in_order_of_sensor(times_ns: Times, settled: NDArray[np.int64] | None = None
     if not (n := int((order != rows).sum())):
         return replace(found, order=order)
     n_pairs = int(((order[:-1] == rows[1:]) & (order[1:] == rows[:-1])).sum())
-    said = f"{n_pairs} pair{'s' * (n > 2)}" if n == 2 * n_pairs else f"{n} frames"
-    said += " were recorded in the wrong order, and were sorted by the sensor's time stamps"
-    problem = said if found.problem is None else f"{said}; {found.problem}"
+    sentence = f"{n_pairs} pair{'s' * (n > 2)}" if n == 2 * n_pairs else f"{n} frames"
+    sentence += " were recorded in the wrong order, and were sorted by the sensor's time stamps"
+    problem = sentence if found.problem is None else f"{sentence}; {found.problem}"
     return replace(found, order=order, problem=problem)
 
 

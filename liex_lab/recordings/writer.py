@@ -78,7 +78,7 @@ class RecordingWriter(ABC):
             self.release()
 
 
-class PictureFolderWriter(RecordingWriter):
+class ImageFolderWriter(RecordingWriter):
     """Writer of a folder of 16-bit PNG images, with a camera.toml and a timestamps.csv.
 
     One image per frame; the stamps are in nanoseconds.
@@ -237,13 +237,13 @@ class FoxgloveMessages:
         message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _SECOND)
         return bytes(message.SerializeToString())
 
-    def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
+    def raw_image(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
         """foxglove.RawImage of unpacked pixels, "16UC1" or "32FC1", row by row without padding."""
         width, height = size
         facts = {"width": width, "height": height, "step": len(data) // height}
         return self._message(0, time_ns, encoding=encoding, data=data, **facts)
 
-    def packed_picture(self, time_ns: int, png: bytes) -> bytes:
+    def packed_image(self, time_ns: int, png: bytes) -> bytes:
         """foxglove.CompressedImage of a 16-bit PNG."""
         return self._message(1, time_ns, format="png", data=png)
 
@@ -309,15 +309,13 @@ class RosMessages:
     schema_encoding = "ros2msg"
     schemas = tuple((name, text.encode()) for name, text in _ROS_SCHEMAS.items())
 
-    def raw_picture(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
+    def raw_image(self, time_ns: int, size: tuple[int, int], encoding: str, data: bytes) -> bytes:
         """sensor_msgs/msg/Image of unpacked pixels, "16UC1" or "32FC1", rows without padding."""
         width, height = size
         head = _Cdr(time_ns).numbers("I", height, width).text(encoding).numbers("B", 0)
         return bytes(head.numbers("I", len(data) // height, len(data)).content) + data
 
-    def packed_picture(
-        self, time_ns: int, data: bytes, how: str = "16UC1; png compressed "
-    ) -> bytes:
+    def packed_image(self, time_ns: int, data: bytes, how: str = "16UC1; png compressed ") -> bytes:
         """sensor_msgs/msg/CompressedImage of a 16-bit PNG, or of an image packed otherwise."""
         return bytes(_Cdr(time_ns).text(how).numbers("I", len(data)).content) + data
 
@@ -428,19 +426,19 @@ class McapDepthWriter(RecordingWriter):
         if self._calibrated_ns is None or time_ns - self._calibrated_ns >= _SECOND:
             self._calibrated_ns = time_ns
             self._log(self._lens, self._messages.calibration(time_ns, self.camera), time_ns)
-        self._log(self._depth, self._picture(frame), time_ns)
+        self._log(self._depth, self._image(frame), time_ns)
 
     def _log(self, channel: int, message: bytes, time_ns: int) -> None:
         logged_ns = max(0, time_ns)  # the time of logging is unsigned; the stamp is authoritative
         self._writer.add_message(channel, logged_ns, message, logged_ns)
 
-    def _picture(self, frame: DepthFrame) -> bytes:
+    def _image(self, frame: DepthFrame) -> bytes:
         if self._packing != "raw":
             exact = steps_of(frame, self._step_mm, exact=True)
             if self._packing == "rvl" and isinstance(self._messages, RosMessages):
                 rvl, how = rvl_message(exact).tobytes(), "16UC1; compressedDepth rvl"
-                return self._messages.packed_picture(frame.time_ns, rvl, how)
-            return self._messages.packed_picture(frame.time_ns, png_of(exact))
+                return self._messages.packed_image(frame.time_ns, rvl, how)
+            return self._messages.packed_image(frame.time_ns, png_of(exact))
         steps = None if self._float else whole_steps(frame.depth, 1.0)
         if steps is not None:
             data = steps.astype("<u2", copy=False).tobytes()
@@ -452,7 +450,7 @@ class McapDepthWriter(RecordingWriter):
             data = scaled.astype("<f4", copy=False).tobytes()
             encoding = "32FC1"
         size = self.camera.width, self.camera.height
-        return self._messages.raw_picture(frame.time_ns, size, encoding, data)
+        return self._messages.raw_image(frame.time_ns, size, encoding, data)
 
     def note(self, facts: Mapping[str, str]) -> None:
         """Write facts (texts by name) known only after all frames, as a metadata record."""

@@ -93,7 +93,7 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
     last: tuple[int, int | None, str] = (0, None, "beginning")
     under_way = 0
 
-    def tell(done: int, total: int | None, what: str) -> None:
+    def forward(done: int, total: int | None, what: str) -> None:
         """Forward a report, and keep it."""
         nonlocal last
         last = (done, total, what)
@@ -116,7 +116,7 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
                 progress(*last)
 
     with event.install_listener("numba:compile", Compiles()):
-        yield tell
+        yield forward
 
 
 class Board:

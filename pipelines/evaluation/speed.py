@@ -48,7 +48,7 @@ from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.streaming import replayed
-from liex_lab.recordings.writer import McapDepthWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import ImageFolderWriter, McapDepthWriter, RecordingWriter
 from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
@@ -494,7 +494,7 @@ def write_moseq(path: Path, camera: Camera, frames: Iterable[DepthFrame]) -> Non
 FORMATS: dict[str, tuple[str, Callable[[Path, Camera, Iterable[DepthFrame]], None], int]] = {
     "mcap_zstd_raw": ("r.mcap", partial(write_with, McapDepthWriter), 1),
     "mcap_zstd_png": ("r.mcap", partial(write_with, partial(McapDepthWriter, packing="png")), 1),
-    "png_folder": ("r", partial(write_with, PictureFolderWriter), 6),
+    "png_folder": ("r", partial(write_with, ImageFolderWriter), 6),
     "moseq_dat": ("r", write_moseq, 1),
 }
 

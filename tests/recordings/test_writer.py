@@ -18,7 +18,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Distortion
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame, depth_mm, metres, nearest_steps, whole_steps
-from liex_lab.recordings.writer import McapDepthWriter, PictureFolderWriter, RecordingWriter
+from liex_lab.recordings.writer import ImageFolderWriter, McapDepthWriter, RecordingWriter
 from tests.recordings.asking import depths_in, exact
 from tests.recordings.writers import SMALL, START_NS, depth_frames, even_times
 
@@ -39,7 +39,7 @@ WRITERS: dict[str, Any] = {
     "ros png": lambda folder: McapDepthWriter(
         folder / "r.mcap", SMALL, messages="ros", packing="png"
     ),
-    "images": lambda folder: PictureFolderWriter(folder / "r", SMALL),
+    "images": lambda folder: ImageFolderWriter(folder / "r", SMALL),
 }
 
 
@@ -178,7 +178,7 @@ def test_what_is_between_steps_has_no_whole_ones() -> None:
 
 
 def exact_and_not(folder: Path, depths: NDArray[np.float32], **how: Any) -> list[str]:
-    return fill(PictureFolderWriter(folder / "r", SMALL, **how), depths)
+    return fill(ImageFolderWriter(folder / "r", SMALL, **how), depths)
 
 
 def test_pictures_refuse_what_they_do_not_keep_unless_told_to_round(tmp_path: Path) -> None:

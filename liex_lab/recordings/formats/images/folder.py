@@ -52,7 +52,7 @@ KINDS: dict[str, tuple[str, ...]] = {  # suffixes of image files
 }
 
 
-def list_pictures(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
+def list_images(folder: Path, pattern: str = "*") -> tuple[str, list[Path]]:
     """The depth images of a folder, in natural order: frame_2 before frame_10.
 
     Args:
@@ -132,7 +132,7 @@ def open_images(
     folder = path if path.is_dir() else path.parent
     camera_toml = CameraFile.read(folder / CAMERA_FILE)
     kind, files = (
-        list_pictures(path, pattern or camera_toml.pattern)
+        list_images(path, pattern or camera_toml.pattern)
         if path.is_dir()
         else (next(kind for kind, ends in KINDS.items() if path.suffix.lower() in ends), [path])
     )

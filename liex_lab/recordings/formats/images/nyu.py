@@ -86,7 +86,7 @@ def open_nyu(
     """
     folder = path if path.is_dir() else path.parent
     camera_toml = CameraFile.read(folder / CAMERA_FILE)
-    files = _pictures(folder, view) if path.is_dir() else [path]
+    files = _images(folder, view) if path.is_dir() else [path]
     stack = open_pngs(files, progress, colour=True)
     camera_toml = replace(
         camera_toml,
@@ -109,10 +109,10 @@ def frame_numbers(folder: Path, view: int = VIEW) -> list[int]:
     Raises:
         RecordingError: there are no such images.
     """
-    return [int(path.stem.split("_")[2]) for path in _pictures(folder, view)]
+    return [int(path.stem.split("_")[2]) for path in _images(folder, view)]
 
 
-def _pictures(folder: Path, view: int) -> list[Path]:
+def _images(folder: Path, view: int) -> list[Path]:
     named = {path: _NAME.fullmatch(path.name) for path in folder.iterdir()}
     files = [path for path, match in named.items() if match and int(match[1]) == view]
     real = [path for path in files if path.name.startswith("depth")] or files

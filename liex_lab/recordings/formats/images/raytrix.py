@@ -39,7 +39,7 @@ from liex_lab.recordings.formats.images.files import (
 )
 from liex_lab.recordings.formats.images.folder import (
     image_recording,
-    list_pictures,
+    list_images,
     natural_key,
     open_stack,
 )
@@ -268,7 +268,7 @@ def open_raytrix(
         files, stack = _open_clouds(folder, profile, camera_toml, camera, progress)
         decode = profile.within
     else:
-        kind, files = list_pictures(folder, profile.pattern)
+        kind, files = list_images(folder, profile.pattern)
         stack = open_stack(kind, files, camera_toml, progress)
         # intrinsics from lens and sensor, unless a camera.toml states measured ones
         if not camera_toml.intrinsics and profile.focal_mm and profile.pitch_mm:

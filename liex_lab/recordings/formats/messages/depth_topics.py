@@ -47,8 +47,8 @@ from liex_lab.recordings.formats.messages.messages import (
 )
 from liex_lab.recordings.formats.messages.parsers import (
     decode_message,
+    image_size,
     parser_of,
-    picture_size,
     plain_schema,
     stated_kind,
 )
@@ -413,7 +413,7 @@ def _note(found: _Found, envelope: Envelope | IndexedMessages, parse: Parser) ->
             known.append((envelope.log_time_ns, message))
         return True
     if channel not in found.depths:
-        size = picture_size(message)
+        size = image_size(message)
         if size is None:
             found.kinds[channel] = stated_kind(message)
             return False
@@ -452,9 +452,9 @@ def _choose(file: MessageFile, found: _Found, topic: str | None) -> _Topic:
 
 
 def _no_depth(file: MessageFile, found: _Found) -> RecordingError:
-    said = {c: f": {printable(why, 200)}" for c, why in (found.failed | found.kinds).items()}
+    reasons = {c: f": {printable(why, 200)}" for c, why in (found.failed | found.kinds).items()}
     described = {
-        f"{printable(c.topic)} ({printable(c.schema)}, {printable(c.encoding)}){said.get(c, '')}"
+        f"{printable(c.topic)} ({printable(c.schema)}, {printable(c.encoding)}){reasons.get(c, '')}"
         for c in file.channels
     }
     listed = ", ".join(sorted(described)[:8]) + (", ..." if len(described) > 8 else "")
@@ -496,7 +496,7 @@ def _camera(
         raise RecordingError(
             f"{path} holds points that lie in no image on {printable(topic.name)}; write a "
             "camera.toml beside it with [camera], width = ... and height = ... in pixels, to say "
-            "which image they are seen in"
+            "which image shows them"
         )
     return camera_file.camera(*size, stated)
 
@@ -509,7 +509,7 @@ def _why_unknown(topic: _Topic, found: _Found) -> str:
         return "; ".join([none, *found.unreadable()])
     usable = any(_is_usable(one) for many in found.calibrations.values() for _, one in many)
     return f"holds calibrations on {names}, " + (
-        f"and neither frames nor names tell which is that of {printable(topic.name)}"
+        f"and neither frames nor names show which is that of {printable(topic.name)}"
         if usable
         else "which are empty (uncalibrated: K is zero)"
     )

@@ -33,7 +33,7 @@ from liex_lab.recordings.timestamps import FAULTS, LIMIT_NS, start_of_clock
 from liex_lab.runtime.memory import why_short
 from liex_lab.runtime.progress import Progress
 
-PICTURE_SCHEMAS = (
+IMAGE_SCHEMAS = (
     "foxglove.RawImage",
     "foxglove.CompressedImage",
     "sensor_msgs/Image",
@@ -51,7 +51,7 @@ class DamagedMessage(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class RawPicture:
+class RawDepthImage:
     """An unpacked image.
 
     Attributes:
@@ -76,7 +76,7 @@ class RawPicture:
 
 
 @dataclass(frozen=True, slots=True)
-class PackedPicture:
+class PackedDepthImage:
     """A packed image.
 
     Attributes:
@@ -159,7 +159,7 @@ class Statement:
     facts: dict[str, str]
 
 
-DepthMessage = RawPicture | PackedPicture | PointCloud
+DepthMessage = RawDepthImage | PackedDepthImage | PointCloud
 Message = DepthMessage | Calibration | Statement
 Parser = Callable[[memoryview], Message]
 

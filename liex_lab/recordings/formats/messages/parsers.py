@@ -27,7 +27,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.images.files import Size, decode_png, png_size, render_points
 from liex_lab.recordings.formats.messages.messages import (
     CLOUD_SCHEMAS,
-    PICTURE_SCHEMAS,
+    IMAGE_SCHEMAS,
     STATEMENT_SCHEMAS,
     STATES,
     Calibration,
@@ -35,10 +35,10 @@ from liex_lab.recordings.formats.messages.messages import (
     DamagedMessage,
     DepthMessage,
     Message,
-    PackedPicture,
+    PackedDepthImage,
     Parser,
     PointCloud,
-    RawPicture,
+    RawDepthImage,
     Statement,
     unpacked_message,
 )
@@ -83,7 +83,7 @@ def stamp_reader(channel: Channel) -> Callable[[memoryview], int | None] | None:
     Returns:
         The function; None for messages without depth, or if their beginning has no stamp.
     """
-    if plain_schema(channel) not in (*PICTURE_SCHEMAS, *CLOUD_SCHEMAS):
+    if plain_schema(channel) not in (*IMAGE_SCHEMAS, *CLOUD_SCHEMAS):
         return None
     if channel.schema.startswith("foxglove."):
         return stamp_in if channel.encoding == "protobuf" else None
@@ -120,13 +120,13 @@ def _stamp(message: Any) -> int:
 _FOXGLOVE: dict[str, tuple[Any, Callable[[Any], Message]]] = {
     "foxglove.RawImage": (
         RawImage,
-        lambda m: RawPicture(
+        lambda m: RawDepthImage(
             _stamp(m), m.frame_id, m.width, m.height, m.encoding, m.step, False, m.data
         ),
     ),
     "foxglove.CompressedImage": (
         CompressedImage,
-        lambda m: PackedPicture(_stamp(m), m.frame_id, m.format, m.data),
+        lambda m: PackedDepthImage(_stamp(m), m.frame_id, m.format, m.data),
     ),
     "foxglove.CameraCalibration": (
         CameraCalibration,
@@ -276,13 +276,15 @@ class _CdrFields(_Fields):
         return self.whole("i") * 10**9 + self.whole(), self.text()  # signed seconds
 
 
-def _image(fields: _Fields) -> RawPicture:
+def _image(fields: _Fields) -> RawDepthImage:
     stamp_ns, frame_id = fields.header()
     height, width = fields.numbers("I", 2)
     encoding = fields.text()
     big_endian = bool(fields.whole("B"))
     step = fields.whole()
-    return RawPicture(stamp_ns, frame_id, width, height, encoding, step, big_endian, fields.blob())
+    return RawDepthImage(
+        stamp_ns, frame_id, width, height, encoding, step, big_endian, fields.blob()
+    )
 
 
 def _camera_info(fields: _Fields) -> Calibration:
@@ -327,7 +329,7 @@ def _text(fields: _Fields) -> Statement:
 
 _PARSERS: dict[str, Callable[[_Fields], Message]] = {
     "sensor_msgs/Image": _image,
-    "sensor_msgs/CompressedImage": lambda fields: PackedPicture(
+    "sensor_msgs/CompressedImage": lambda fields: PackedDepthImage(
         *fields.header(), fields.text(), fields.blob()
     ),
     "sensor_msgs/CameraInfo": _camera_info,
@@ -363,7 +365,7 @@ def _header_stamp(layout: type[_Fields], head: memoryview) -> int | None:
 # Decoders of images and point clouds in messages to depth, shared by MCAP files and ROS bags.
 
 
-LARGEST_PICTURE = (
+MOST_PIXELS = (
     1 << 24
 )  # pixels; more than any depth camera: a damaged size would need all the memory
 _METRE = 1000.0
@@ -378,7 +380,7 @@ _CONFIG = struct.Struct(
 _RVL_SIZE = struct.Struct("<II")
 
 
-def picture_size(message: DepthMessage) -> tuple[int, int] | None:
+def image_size(message: DepthMessage) -> tuple[int, int] | None:
     """Size of a depth image, without decoding it.
 
     Args:
@@ -394,7 +396,7 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
         known = {"x", "y", "z"} <= message.columns.keys() and 0 < n <= (1 << 22)
         size = (message.width, message.height) if message.height > 1 else (0, 0)
         return size if known else None
-    if isinstance(message, RawPicture):
+    if isinstance(message, RawDepthImage):
         found: Size | None = (message.width, message.height)
         if message.encoding not in _ENCODINGS:
             return None
@@ -404,7 +406,7 @@ def picture_size(message: DepthMessage) -> tuple[int, int] | None:
             found = _RVL_SIZE.unpack_from(body) if is_rvl else png_size(bytes(body[:26]), "image")
         except (RecordingError, struct.error):
             return None  # a colour PNG is not depth
-    fits = found is not None and min(found) > 0 and found[0] * found[1] <= LARGEST_PICTURE
+    fits = found is not None and min(found) > 0 and found[0] * found[1] <= MOST_PIXELS
     return found if fits else None
 
 
@@ -412,7 +414,7 @@ def stated_kind(message: DepthMessage) -> str:
     """Stated type of a message's content, for error messages."""
     if isinstance(message, PointCloud):
         return f"points of {', '.join(message.columns) or 'nothing'}"
-    if isinstance(message, RawPicture):
+    if isinstance(message, RawDepthImage):
         return (
             f"{message.encoding}, {message.width} x {message.height} pixels in rows of "
             f"{message.step} bytes, {len(message.data)} bytes in all"
@@ -420,7 +422,7 @@ def stated_kind(message: DepthMessage) -> str:
     return message.packing.strip()
 
 
-def _unwrapped(message: PackedPicture) -> tuple[bool, memoryview]:
+def _unwrapped(message: PackedDepthImage) -> tuple[bool, memoryview]:
     """Whether an image is RVL, and its data after the configuration of ROS's compressedDepth."""
     data = memoryview(message.data)
     if "compressedDepth" not in message.packing:
@@ -448,12 +450,12 @@ def decode_message(
     Returns:
         (H, W) float32 mm of the camera's size; None if the message has no such image.
     """
-    if picture_size(message) not in ((camera.width, camera.height), (0, 0)):
+    if image_size(message) not in ((camera.width, camera.height), (0, 0)):
         return None
     if isinstance(message, PointCloud):
         z_mm = _cloud_depth(message, camera)
         return None if z_mm is None else depth_mm(z_mm, scale, unread)
-    if isinstance(message, RawPicture):
+    if isinstance(message, RawDepthImage):
         stored = _raw_pixels(message)
         metric = _ENCODINGS[message.encoding][1]
     else:
@@ -464,7 +466,7 @@ def decode_message(
     return depth_mm(stored, scale * (step_mm if metric == 1.0 else metric), unread)
 
 
-def _raw_pixels(message: RawPicture) -> NDArray[Any] | None:
+def _raw_pixels(message: RawDepthImage) -> NDArray[Any] | None:
     order = ">" if message.big_endian else "<"
     dtype = np.dtype(order + _ENCODINGS[message.encoding][0])
     height, width = message.height, message.width
@@ -478,7 +480,7 @@ def _raw_pixels(message: RawPicture) -> NDArray[Any] | None:
     return np.ndarray((height, width), dtype, message.data, strides=(step, dtype.itemsize))
 
 
-def _packed_pixels(message: PackedPicture) -> NDArray[Any] | None:
+def _packed_pixels(message: PackedDepthImage) -> NDArray[Any] | None:
     is_rvl, body = _unwrapped(message)
     if is_rvl:
         from liex_lab.recordings.depth_kernels import unpack_rvl
