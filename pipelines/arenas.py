@@ -95,7 +95,7 @@ def run_arenas(
     ):
         if problem := unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {problem}")
-        compile_ahead(first.animal.skeleton, progress)
+        compile_ahead(first.animal.skeleton, progress=progress)
         # memory for frames that the arenas share to learn their scenes
         shared = opened.remembering(256 * 2**20)
         arenas = arenas_of(shared, first)

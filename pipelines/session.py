@@ -327,7 +327,7 @@ def run_session(
             cautions = _check_subject(opened, Path(recording), first)
         check_unused(folder, overwrite)
         unnamed = None if plan else settings
-        compile_ahead(first.animal.skeleton, progress)
+        compile_ahead(first.animal.skeleton, progress=progress)
         progress(0, None, "learning the background, the floor and the animal's size")
         fitted = fit_plan(opened, first, estimator, settings=unnamed, progress=progress)
         fitted = replace(fitted, notes=(*fitted.notes, *cautions))

@@ -66,8 +66,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     if session.config.args_source is pytest.Config.ArgsSource.TESTPATHS:
         from liex_lab.pipelines.compiling import compile_ahead
 
-        for animal in ("mouse", "fish", "hand"):
-            compile_ahead(animal)
+        compile_ahead("mouse", "fish", "hand")
 
 
 def excuse(report: pytest.TestReport | pytest.CollectReport) -> str:

@@ -279,7 +279,7 @@ def _fill_inputs(lanes, n, joint, batch, reach, candidates):
             size,
             scalars,
         )
-        _write_scalars(lanes, s, 0, scalars)
+        _write_scalars(lanes, s, np.int64(0), scalars)
 
 
 @inner_kernel()
@@ -310,7 +310,7 @@ def _fill_all_inputs(lanes, n, batch, reach, body, candidates):
         fill_scalars(
             rotations[i, k, 0], positions[i, k, 0], scales[i, k], batch.moments[i], size, scalars
         )
-        _write_scalars(lanes, s, 0, scalars)
+        _write_scalars(lanes, s, np.int64(0), scalars)
         if body.radius.size > 0:
             explain_pose(
                 batch.heights[i],
@@ -323,7 +323,7 @@ def _fill_all_inputs(lanes, n, batch, reach, body, candidates):
                 body,
                 fit,
             )
-            _write_scalars(lanes, s, N_SCALARS, fit)
+            _write_scalars(lanes, s, np.int64(N_SCALARS), fit)
 
 
 @inner_kernel()
@@ -442,7 +442,7 @@ def _estimate_block(
     side = heights.shape[1]
     n_joints = poses.positions.shape[2]
     n_starts = starts.scales.shape[1]
-    lanes = _lanes_for(heights, frames, n_starts, 1, batch.size)
+    lanes = _lanes_for(heights, frames, n_starts, np.int64(1), batch.size)
     n = frames.size * n_starts
     values = np.empty((lanes.base.size, 7))
     # typed as numbers: a kernel would be compiled for every literal
@@ -450,7 +450,7 @@ def _estimate_block(
     no_view = np.int64(0)
     _solve_joint(tuning.solved[0], first, tree, regressors, tuning, lanes, n, batch, starts, values)
     if tuning.keep < n_starts:
-        _fill_inputs(lanes, n, 0, batch, tuning.reach, starts)
+        _fill_inputs(lanes, n, np.int64(0), batch, tuning.reach, starts)
         _predict(pruner, first, lanes, n, no_view, side, 0.0, values)
     chosen = np.arange(tuning.keep)
     early = np.empty(n_starts)

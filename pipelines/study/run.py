@@ -271,8 +271,7 @@ def _crew(
         return
 
     if not where["scheduler"] and not where["slurm"]:  # once, instead of in every worker
-        for animal in sorted({session.plan.animal.skeleton for session in [*todo, *unseen]}):
-            compile_ahead(animal)
+        compile_ahead(*sorted({session.plan.animal.skeleton for session in [*todo, *unseen]}))
     # inspecting one session may make others of its animal pending
     most = sum(one.state != "excluded" for one in found) if unseen else len(todo)
     with crew_of(max(most, len(unseen)), **where) as crew:

@@ -69,11 +69,11 @@ def test_a_run_calls_only_kernels_that_are_listed(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[list[int]]]:
+def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[list[str]]]:
     """What processes were asked to compile; the first time they fail."""
-    asked: list[list[list[int]]] = []
+    asked: list[list[list[str]]] = []
 
-    def compile_shares(animal: str, shares: list[list[int]], report: Callable[[], None]) -> bool:
+    def compile_shares(shares: list[list[str]], report: Callable[[], None]) -> bool:
         asked.append(shares)
         for _ in chain.from_iterable(shares):
             report()
@@ -81,28 +81,32 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[list[int
 
     monkeypatch.setattr(compiling, "_compile", compile_shares)
     monkeypatch.setattr(compiling, "n_cores", lambda: 2)
-    monkeypatch.setattr(compiling, "_mark", lambda animal, rows: tmp_path / "mark")
+    monkeypatch.setattr(compiling, "_mark", lambda animal: tmp_path / f"mark-{animal}")
     return asked
 
 
 def test_a_machine_compiles_until_it_succeeds_once_and_each_core_about_as_long(
-    asked: list[list[list[int]]],
+    asked: list[list[list[str]]],
 ) -> None:
-    told: list[int] = []
+    done: list[int] = []
     assert not compile_ahead("mouse")
-    assert compile_ahead("mouse", lambda done, total, what: told.append(done))
+    assert compile_ahead("mouse", progress=lambda n, total, what: done.append(n))
     assert not compile_ahead("mouse")
-    cost = [row["cpu_s"] for row in listed_kernels("mouse")]
+    cost = {f"mouse:{k}": row["cpu_s"] for k, row in enumerate(listed_kernels("mouse"))}
     assert len(asked) == 2
-    assert sorted(chain.from_iterable(asked[1])) == list(range(len(cost)))
+    assert sorted(chain.from_iterable(asked[1])) == sorted(cost)
     spent = [sum(cost[row] for row in share) for share in asked[1]]
     assert len(spent) == 2
     assert max(spent) < 1.2 * min(spent)
-    assert told == list(range(len(cost) + 1))
+    assert done == list(range(len(cost) + 1))
+    assert compile_ahead("mouse", "fish")
+    fish = [row for row in chain.from_iterable(asked[2]) if row.startswith("fish:")]
+    assert fish
+    assert sorted(fish) == sorted(chain.from_iterable(asked[2]))  # the mouse's are there
 
 
 def test_on_one_core_the_run_compiles_what_it_calls(
-    asked: list[list[list[int]]], monkeypatch: pytest.MonkeyPatch
+    asked: list[list[list[str]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compiling, "n_cores", lambda: 1)
     assert not compile_ahead("mouse")
@@ -118,11 +122,11 @@ def test_processes_compile_what_is_installed_wherever_they_are_started(
     (other / "__init__.py").write_text("raise SystemExit(3)  # the sources of another version")
     monkeypatch.chdir(tmp_path)
     kernels = [row["kernel"].split(":")[1] for row in listed_kernels("mouse")]
-    shares = [[kernels.index("place_joints")], [kernels.index("number_nodes")]]
-    told: list[None] = []
-    assert compiling._compile("mouse", shares, lambda: told.append(None))
-    assert len(told) == 2
-    assert not compiling._compile("mouse", [[10_000]], lambda: None)
+    shares = [[f"mouse:{kernels.index(name)}"] for name in ("place_joints", "number_nodes")]
+    reported: list[None] = []
+    assert compiling._compile(shares, lambda: reported.append(None))
+    assert len(reported) == 2
+    assert not compiling._compile([["mouse:10000"]], lambda: None)
 
 
 def test_a_kernel_that_is_called_otherwise_now_is_left_to_the_run() -> None:

@@ -49,7 +49,7 @@ def here(n_tasks: int, **_: Any) -> Any:
 @pytest.fixture(autouse=True)
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("liex_lab.pipelines.study.run.crew_of", here)
-    monkeypatch.setattr("liex_lab.pipelines.study.run.compile_ahead", lambda _: None)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.compile_ahead", lambda *_: None)
 
 
 def make_study(folder: Path, sessions: Sessions, head: str = 'shared = "subject"\n') -> Path:
