@@ -15,38 +15,17 @@ from liex_lab.sessions import Session
 N_FRAMES, SPINE_MM = 24, 34.0
 
 
-@pytest.fixture(scope="module")
-def fish() -> tuple[Session, np.ndarray]:
-    """A session of a fish, and its true joints (n, J, 3) mm in the camera frame."""
+def test_a_fish_is_measured_with_the_bundled_model(tmp_path):
     swim = open_recording(f"synthetic:swim?seed=11&frames={N_FRAMES}&spine_mm={SPINE_MM}")
-    return swim, swim.joints_camera  # type: ignore[attr-defined,return-value]
-
-
-@pytest.fixture(scope="module")
-def session(fish, tmp_path_factory) -> Session:
-    return Session.open(run_session(fish[0], Plan.load("fish"), tmp_path_factory.mktemp("fish")))
-
-
-def test_every_frame_has_a_pose_near_the_truth(session, fish):
+    session = Session.open(run_session(swim, Plan.load("fish"), tmp_path, report=False))
     joints = session.poses[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(N_FRAMES, -1, 3)
-    off = np.linalg.norm(session.T_arena_camera.inverse() @ joints - fish[1], axis=-1).mean(axis=1)
+    true = swim.joints_camera  # type: ignore[attr-defined]
+    off = np.linalg.norm(session.T_arena_camera.inverse() @ joints - true, axis=-1).mean(axis=1)
     assert np.isfinite(off).mean() > 0.95
     assert np.nanmean(off) < 0.03 * SPINE_MM
-    assert session.metadata["animal"]["joints"][0] == "head"
-
-
-def test_its_size_is_measured(session):
-    assert session.metadata["animal"]["spine_mm"] == pytest.approx(SPINE_MM, rel=0.05)
-
-
-def test_the_predicted_error_is_of_the_right_size(session, fish):
-    joints = session.poses[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(N_FRAMES, -1, 3)
-    off = np.linalg.norm(session.T_arena_camera.inverse() @ joints - fish[1], axis=-1).mean(axis=1)
     assert 0.4 < np.nanmedian(session.frames["predicted_error_mm"]) / np.nanmedian(off) < 2.5
-
-
-def test_the_tables_speak_of_a_fish(session):
-    assert (session.path / "report.html").is_file()
+    assert session.metadata["animal"]["joints"][0] == "head"
+    assert session.metadata["animal"]["spine_mm"] == pytest.approx(SPINE_MM, rel=0.05)
     assert set(session.poses["joint"]) >= {"head", "tail_tip"}
     assert (session.frames["flag"].fillna("") == "").mean() > 0.8
 

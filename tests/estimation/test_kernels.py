@@ -9,7 +9,6 @@ from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.forests._kernels import VIEW
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, Camera
-from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import HeightMaps
@@ -83,44 +82,6 @@ def test_a_joint_and_offsets_from_it_are_seen_as_the_exact_projection_sees_them(
         np.testing.assert_allclose(view[2:8].reshape(2, 3).T, (ahead - behind) / 2e-3, atol=1e-8)
 
 
-def test_a_batch_of_looks_agrees_with_one_look_at_a_time():
-    rng = np.random.default_rng(4)
-    window, n = WINDOWS[1], 7
-    rotations, positions = so3.exp(rng.normal(0, 1, (n, 3, 3))), rng.uniform(-50, 50, (n, 3, 3))
-    moments = rng.uniform(10, 100, (2, 9))
-    size, scale, image = (
-        rng.uniform(0.8, 1.2, n),
-        rng.uniform(0.8, 1.2, n),
-        np.arange(n, dtype=np.int32) % 2,
-    )
-    views, scalars = np.empty((n, 2, VIEW)), np.empty((n, kernels.N_SCALARS))
-    reach = np.full(2, REACH)
-    in_parallel(
-        kernels.all_features,
-        n,
-        np.array([2, 0]),
-        np.stack([window.look] * 2),
-        moments,
-        image,
-        size,
-        reach,
-        rotations,
-        positions,
-        scale,
-        kernels.FeatureRows(views, scalars),
-    )
-    for s in range(n):
-        own = np.empty(kernels.N_SCALARS)
-        kernels.fill_scalars(
-            rotations[s, 2], positions[s, 2], scale[s], moments[image[s]], size[s], own
-        )
-        np.testing.assert_array_equal(scalars[s], own)
-        for v, joint in enumerate((2, 0)):
-            np.testing.assert_array_equal(
-                views[s, v], window.view(rotations[s, joint], positions[s, joint], size[s])
-            )
-
-
 @pytest.mark.parametrize(("turned", "grown"), [(0.7, 1.0), (-2.9, 1.0), (0.0, 1.6), (2.0, 0.7)])
 def test_the_numbers_about_the_whole_animal_do_not_change_when_it_turns_or_grows(turned, grown):
     rng = np.random.default_rng(5)
@@ -144,78 +105,6 @@ def test_the_numbers_about_the_whole_animal_do_not_change_when_it_turns_or_grows
         turn @ rotation, grown * turn @ position, 0.95 * grown, moved, grown, after
     )
     np.testing.assert_allclose(after, before, atol=1e-8)
-
-
-TURNS = [
-    0.0,
-    1e-12,
-    1e-7,
-    0.99e-4,
-    1.01e-4,
-    0.99e-3,
-    1.01e-3,
-    0.3,
-    2.0,
-    np.pi - 1e-9,
-    np.pi,
-    np.pi + 0.4,
-]
-
-
-@pytest.mark.parametrize("angle", TURNS)
-def test_a_correction_of_the_base_is_a_product_on_the_right(angle):
-    rng = np.random.default_rng(6)
-    for size in (1.0, 1.7):
-        axis = rng.normal(0, 1, 3)
-        twist = np.concatenate([angle * axis / np.linalg.norm(axis), rng.normal(0, 15, 3), [0.11]])
-        rotation, position = drawn_joint(rng)
-        expected = SE3(rotation, position) @ SE3.exp(twist[:6] * [1, 1, 1, size, size, size])
-        got_rotation, got_position = rotation.copy(), position.copy()
-        scale = kernels.correct_base(got_rotation, got_position, 0.9, twist, size)
-        np.testing.assert_allclose(got_rotation, expected.rotation, atol=1e-12)
-        np.testing.assert_allclose(got_position, expected.translation, atol=1e-9)
-        assert scale == pytest.approx(0.9 * np.exp(0.11))
-
-
-def test_corrections_of_a_batch_count_in_levers_and_leave_the_scale_alone_without_a_seventh_value():
-    rng = np.random.default_rng(7)
-    rotations, positions = so3.exp(rng.normal(0, 1, (4, 2, 3))), rng.normal(0, 20, (4, 2, 3))
-    scale, size = rng.uniform(0.8, 1.2, 4), rng.uniform(0.8, 1.2, 4)
-    values = rng.normal(0, 5, (4, 7)).astype(np.float32)
-    for width in (6, 7):
-        got_rotation, got_position, got_scale = rotations.copy(), positions.copy(), scale.copy()
-        kernels.correct_base_all(
-            got_rotation,
-            got_position,
-            got_scale,
-            values[:, :width],
-            np.array([30.0, 50.0]),
-            size,
-            0,
-            4,
-        )
-        twist = values[:, :6].astype(float) * (1 / 30.0, 1 / 30.0, 1 / 30.0, 1, 1, 1)
-        twist[:, 3:] *= size[:, None]
-        expected = SE3(rotations[:, 0], positions[:, 0]) @ SE3.exp(twist)
-        np.testing.assert_allclose(got_rotation[:, 0], expected.rotation, atol=1e-12)
-        np.testing.assert_allclose(got_position[:, 0], expected.translation, atol=1e-9)
-        np.testing.assert_array_equal(got_rotation[:, 1], rotations[:, 1])
-        grown = np.exp(values[:, 6].astype(float) / 50.0) if width == 7 else 1.0
-        np.testing.assert_allclose(got_scale, scale * grown, rtol=1e-12)
-
-
-@pytest.mark.parametrize("axes", [(0, 1, 1), (0, 0, 1), (1, 0, 0), (1, 1, 1)])
-def test_a_joint_turns_on_the_right_about_its_free_axes_only(axes):
-    rng = np.random.default_rng(8)
-    free = np.array(axes, bool)
-    for strength in (0.0, 1e-6, 0.5, 3.0):
-        values = strength * 20.0 * rng.normal(0, 1, int(free.sum()))
-        turn = np.zeros(3)
-        turn[free] = values / 20.0
-        rotation = so3.exp(rng.normal(0, 1, 3))
-        got = rotation.copy()
-        kernels.correct_joint(got, free, values, 20.0)
-        np.testing.assert_allclose(got, rotation @ so3.exp(turn), atol=1e-12)
 
 
 @pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])

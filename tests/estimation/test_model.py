@@ -5,6 +5,7 @@ refused in a sentence.
 import io
 import json
 import pickle
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -24,9 +25,7 @@ from liex_lab.estimation.scoring import clue_samples
 from liex_lab.estimation.training import calibrate
 from liex_lab.forests.forest import Forest
 from liex_lab.mlp import Network
-from tests.estimation.toy import SCENE, tiny, toy_mice, train, trained, training_set, unseen
-
-VARIANTS = ["default", "paper"]
+from tests.estimation.toy import SCENE, tiny, toy_mice, train, unseen
 
 
 @pytest.fixture(scope="module")
@@ -97,21 +96,6 @@ def refusal(folder: Path, content: bytes, name: str = "model.npz") -> str:
     return sentence
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_a_model_comes_out_of_its_file_as_it_went_in(tmp_path, variant):
-    model = trained(variant).model
-    (tmp_path / "toy.npz").write_bytes(model.to_bytes())
-    loaded = Model.load(tmp_path / "toy.npz")
-    for before, after in zip(forests_of(model), forests_of(loaded), strict=True):
-        np.testing.assert_array_equal(after.nodes, before.nodes)
-        np.testing.assert_array_equal(after.roots, before.roots)
-        np.testing.assert_array_equal(after.leaves, before.leaves)
-    assert loaded.method == model.method
-    assert loaded.calibration == model.calibration
-    assert loaded.to_bytes() == model.to_bytes()
-    assert loaded.digest() == model.digest()
-
-
 def test_corrections_of_a_model_come_out_of_its_file_as_they_went_in(tmp_path, model):
     j = model.skeleton.n_joints
     parts = {
@@ -125,39 +109,15 @@ def test_corrections_of_a_model_come_out_of_its_file_as_they_went_in(tmp_path, m
         path.write_bytes(whole.to_bytes())
         loaded = Model.load(path)
         assert loaded.to_bytes() == whole.to_bytes()
+        assert (loaded.card, loaded.calibration) == (model.card, model.calibration)
         assert [getattr(loaded, name) is None for name in parts] == [
             getattr(whole, name) is None for name in parts
         ]
         np.testing.assert_array_equal(loaded.settler, whole.settler)
 
 
-def test_facts_about_the_model_and_its_expectation_come_out_as_well(tmp_path, model):
-    whole = calibrate(model, training_set(unseen(), model.method), np.random.default_rng(0))
-    (tmp_path / "toy.npz").write_bytes(whole.to_bytes())
-    loaded = Model.load(tmp_path / "toy.npz")
-    assert loaded.card == {"animal": "mouse", "seed": 20}
-    assert loaded.calibration == whole.calibration
-    assert loaded.calibration.area_mm2 == 1111.0
-    assert loaded.skeleton.names == model.skeleton.names
-    assert loaded.expectation is not None
-    assert whole.expectation is not None
-    np.testing.assert_array_equal(loaded.expectation.leaves, whole.expectation.leaves)
-
-
-def test_an_estimator_measures_the_same_with_the_model_read_back(tmp_path, model, content):
-    (tmp_path / "toy.npz").write_bytes(content)
-    before, after = (
-        estimator.estimate(unseen().depths[:8], SCENE, 1.0).chosen
-        for estimator in (PoseEstimator(model), PoseEstimator.load(tmp_path / "toy.npz"))
-    )
-    np.testing.assert_array_equal(
-        after.pose.joints(model.skeleton), before.pose.joints(model.skeleton)
-    )
-    np.testing.assert_array_equal(after.error_mm, before.error_mm)
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_equal_training_gives_equal_bytes_with_one_thread_and_with_two(variant):
+@pytest.mark.parametrize("variant", ["default", "paper"])
+def test_equal_training_gives_equal_bytes_from_which_the_model_is_read_back(tmp_path, variant):
     method = replace(tiny(variant), rounds=1)
     toy, made = toy_mice(80, 3), []
     threads = numba.get_num_threads()
@@ -165,24 +125,25 @@ def test_equal_training_gives_equal_bytes_with_one_thread_and_with_two(variant):
         numba.set_num_threads(n)
         try:
             result = train(toy, method, seed=5)
-            made.append(calibrate(result.model, result.data, np.random.default_rng(1)).to_bytes())
+            model = calibrate(result.model, result.data, np.random.default_rng(1))
+            made.append(model.to_bytes())
         finally:
             numba.set_num_threads(threads)
     assert made[0] == made[1]
     assert train(toy, method, seed=6).model.to_bytes() != made[0]
+    (tmp_path / "toy.npz").write_bytes(made[0])
+    loaded = Model.load(tmp_path / "toy.npz")
+    for before, after in zip(forests_of(model), forests_of(loaded), strict=True):
+        for name in ("nodes", "roots", "leaves"):
+            np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    assert (loaded.method, loaded.calibration) == (model.method, model.calibration)
+    assert (loaded.to_bytes(), loaded.digest()) == (made[0], model.digest())
 
 
 def test_equal_models_are_equal_bytes_whatever_the_day(model, content, monkeypatch):
     monkeypatch.setattr("time.time", lambda: 2e9)
     monkeypatch.setattr("time.localtime", lambda *_: (2033, 5, 18, 3, 33, 20, 2, 138, 0))
     assert model.to_bytes() == content
-
-
-def test_there_is_no_pickle_inside(content):
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        assert all(archive[name].dtype != object for name in archive.files)
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        assert all(archive.read(name).startswith(b"\x93NUMPY") for name in archive.namelist())
 
 
 def test_a_file_that_would_run_code_is_refused_unread(tmp_path):
@@ -236,43 +197,52 @@ def test_a_file_whose_head_lacks_a_section_or_has_other_fields_is_refused(
     refusal(tmp_path, repacked(content, change))
 
 
-@pytest.mark.parametrize("root", [2**30, -1, -(2**31), 1, 7])
-@pytest.mark.parametrize("which", ["000", "007"])
-def test_roots_that_lead_outside_of_the_forest_are_refused(tmp_path, content, which, root):
-    roots = array_of(content, f"{which}_roots")
-    for place in (0, len(roots) - 1):
-        changed = roots.copy()
-        changed[place] = root
-        said = refusal(tmp_path, repacked(content, arrays={f"{which}_roots": changed}))
-        assert "roots" in said or "complete trees" in said
+def root_at(place: int, root: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Roots of which one was changed."""
+    return lambda roots: np.where(np.arange(len(roots)) == place % len(roots), root, roots)
 
 
-@pytest.mark.parametrize("which", ["000", "003", "007"])
-@pytest.mark.parametrize("kind", [3, 4 * 60, 1 + 4 * 60, 2 + 4 * 60])
-def test_a_test_beyond_the_views_and_scalars_is_refused(tmp_path, content, which, kind):
-    kinds = array_of(content, f"{which}_kind").copy()
-    kinds[len(kinds) // 2] = kind
-    assert "a test" in refusal(tmp_path, repacked(content, arrays={f"{which}_kind": kinds}))
+def middle_kind(kind: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Kinds of tests of which one was changed."""
+    return lambda kinds: np.where(np.arange(len(kinds)) == len(kinds) // 2, kind, kinds)
 
 
-def test_an_offset_that_growth_never_writes_is_refused(tmp_path, content):
-    tests = array_of(content, "000_tests").copy()
-    tests[3, -1] = -128
-    assert "an offset" in refusal(tmp_path, repacked(content, arrays={"000_tests": tests}))
-
-
-@pytest.mark.parametrize("part", ["tests", "threshold", "kind", "is_leaf", "roots", "leaves"])
-def test_arrays_of_a_forest_of_another_size_or_type_are_refused(tmp_path, content, part):
-    name = f"000_{part}"
-    values = array_of(content, name)
-    for changed in (values[..., :-1], values.astype(np.float64), values[None], values[..., :0]):
-        assert "model" in refusal(tmp_path, repacked(content, arrays={name: changed}))
-
-
-def test_leaves_that_are_not_finite_or_of_another_width_are_refused(tmp_path, content):
-    leaves = array_of(content, "000_leaves")
-    for changed in (leaves * np.float16(np.nan), leaves[:-1]):
-        assert "its leaves" in refusal(tmp_path, repacked(content, arrays={"000_leaves": changed}))
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        *(
+            (f"{which}_roots", root_at(place, root), "root|complete trees")
+            for which in ("000", "007")
+            for place in (0, -1)
+            for root in (2**30, -1, -(2**31), 7)
+        ),
+        *(
+            (f"{which}_kind", middle_kind(kind), "a test")
+            for which in ("000", "003", "007")
+            for kind in (3, 4 * 60, 1 + 4 * 60, 2 + 4 * 60)
+        ),
+        ("000_tests", lambda tests: np.where(tests == tests.max(), -128, tests), "an offset"),
+        ("000_leaves", lambda leaves: leaves * np.float16(np.nan), "its leaves"),
+        ("000_leaves", lambda leaves: leaves[:-1], "its leaves"),
+        *(
+            (f"000_{part}", change, "model")
+            for part in ("tests", "threshold", "kind", "is_leaf", "roots", "leaves")
+            for change in (
+                lambda values: values[..., :-1],
+                lambda values: values.astype(np.float64),
+                lambda values: values[None],
+                lambda values: values[..., :0],
+            )
+        ),
+        ("settler", lambda _: np.zeros((3, 3)), "ridge"),
+    ],
+)
+def test_arrays_that_are_no_forest_of_this_model_are_refused(tmp_path, content, name, change, says):
+    values = array_of(content, name) if name != "settler" else np.zeros(1)
+    changed = change(values)
+    if says != "model":
+        changed = changed.astype(values.dtype)
+    assert re.search(says, refusal(tmp_path, repacked(content, arrays={name: changed})))
 
 
 @pytest.mark.parametrize(
@@ -301,8 +271,7 @@ def test_numbers_of_the_method_that_make_no_sense_are_refused(
     assert refusal(tmp_path, repacked(content, change))
 
 
-def test_tables_of_another_skeleton_are_refused(tmp_path, content):
-    assert "ridge" in refusal(tmp_path, repacked(content, arrays={"settler": np.zeros((3, 3))}))
+def test_layers_of_another_network_are_refused(tmp_path, content):
     for weights in (np.zeros((5, 3)), np.zeros((5, 4)), np.zeros(4)):
         layer = {
             "facing_0_bias": np.zeros(4, np.float16),

@@ -11,7 +11,6 @@ import pytest
 
 from liex_lab.body.shape import BodyShape
 from liex_lab.catalog import find_model
-from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.estimation.model import Model
 from liex_lab.estimation.session_shape import (
     N_STATIONS,
@@ -23,7 +22,6 @@ from liex_lab.estimation.session_shape import (
     labels_of,
     session_clues,
 )
-from liex_lab.scene._height_map_kernels import CropCamera, to_pixel
 from liex_lab.scene.height_maps import view_of
 from tests.estimation.toy import SCENE, Toy, rendered, toy_mice
 
@@ -69,34 +67,6 @@ def test_the_back_of_a_higher_body_lies_higher_and_falls_farther(toy):
     np.testing.assert_allclose(lies, 0.4 * usual, rtol=0.12)
     falls = [one[middle, 0] - one[middle, 10] for one in (flat, high)]
     assert (falls[1] > 1.2 * falls[0]).all()
-
-
-def test_the_kernel_agrees_with_the_loop_a_reader_would_write():
-    rng = np.random.default_rng(3)
-    heights = (rng.integers(0, 40, (2, 30, 30)) * 16 * (rng.random((2, 30, 30)) < 0.6)).astype(
-        np.int16
-    )
-    numbers = [20.0, 20.0, 15.0, 15.0, *np.eye(3).ravel(), 50.0, 0.0, 0.0, 1.0]
-    camera = CropCamera._make(numbers)
-    # the camera looks along the axis that heights are measured against
-    camera = camera._replace(r11=-1.0, r22=-1.0)
-    cameras = np.tile(np.array(camera), (2, 1))
-    points = rng.uniform(-20, 20, (2, 3, 3))
-    sideways = rng.normal(size=(2, 3, 2))
-    lateral = np.array([1.0, 4.0, 30.0])
-    seen, height = np.empty((2, 3, 3)), np.empty((2, 3, 3))
-    kernels.read_across(heights, cameras, points, sideways, lateral, seen, height, 0, 2)
-    for i, s, t in np.ndindex(2, 3, 3):
-        readings = []
-        for side in (-1.0, 1.0):
-            x, y = points[i, s, :2] + side * lateral[t] * sideways[i, s]
-            u, v = to_pixel(camera, x, y, points[i, s, 2])
-            column, row = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
-            if 0 <= row < 30 and 0 <= column < 30 and heights[i, row, column] > 0:
-                readings.append(heights[i, row, column] / 16.0 - points[i, s, 2])
-        assert seen[i, s, t] == len(readings) / 2
-        assert height[i, s, t] == pytest.approx(np.mean(readings) if readings else 0.0)
-    assert 0 < seen.sum() < seen.size
 
 
 def test_a_linear_map_is_found_again_and_its_noise_is_told(tmp_path: Path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from liex_lab.estimation.cascade import Candidates, TrainingSet
+from liex_lab.estimation.cascade import TrainingSet
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.scoring import with_expected_error
 from liex_lab.estimation.training import (
@@ -86,17 +86,6 @@ def test_the_learned_metric_ranks_candidates_by_their_true_error(variant):
     assert np.median(chosen) < 2.0 * np.median(error.min(axis=1))
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_every_solved_joint_gets_a_forest_for_each_round_that_the_model_file_can_hold(variant):
-    model = trained(variant).model
-    cascade = model.cascade
-    for joint, rounds in zip(cascade.skeleton.solved, cascade.forests, strict=True):
-        assert len(rounds) == 2
-        for forest in (*rounds, model.metric):
-            np.testing.assert_array_equal(forest.leaves, forest.leaves.astype(np.float16))
-        assert {forest.leaves.shape[1] for forest in rounds} == {cascade.n_values(joint)}
-
-
 def test_training_starts_both_ways_along_the_animal_and_is_unsure_of_its_size():
     data, method = trained("default").data, replace(tiny("default"), training_candidates=8)
     skeleton = trained("default").model.skeleton
@@ -140,14 +129,6 @@ def test_perturbed_truth_is_a_pose_with_the_animals_own_bones_up_to_badly_off(va
     error = joint_error(examples, learned.data.truth)
     assert np.quantile(error, 0.02) < 2.0
     assert np.quantile(error, 0.98) > 15.0
-
-
-def test_joint_errors_are_told_at_home_size():
-    data = trained("default").data
-    n, moved = len(data.size), data.truth.positions + np.array([3.0, 0.0, 4.0])
-    image = np.arange(n, dtype=np.int32)
-    candidates = Candidates(image, data.truth.rotations, moved, data.truth.scale, np.full(n, 2.0))
-    np.testing.assert_allclose(joint_error(candidates, data.truth), 2.5)
 
 
 def test_what_is_no_animal_teaches_the_metric_and_not_the_regressors():
@@ -208,13 +189,3 @@ def test_calibration_keeps_the_area_and_finds_the_nose_the_hardest_joint(held_ou
     assert np.argmax(after.calibration.joint_share) == 4
     assert after.cascade is before.cascade
     assert after.expectation is not None
-
-
-def test_without_an_expectation_forest_the_straight_line_stays():
-    model, toy = trained("default").model, unseen()
-    assert model.expectation is None
-    crops = SCENE.extract(toy.depths[:5], 1.0)
-    crop_cameras = SCENE.crop_cameras(crops)
-    detection = PoseEstimator(model).candidates(crops, crop_cameras, 1.0)
-    picked = PoseEstimator(model).pick(detection, 1.0)
-    assert with_expected_error(picked, model, detection.images, 1.0) is picked

@@ -10,8 +10,6 @@ import pytest
 from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
-from liex_lab.scene._blob_kernels import MAX_BLOBS, N_BLOB, Blob
-from liex_lab.scene._height_map_kernels import AREA_FACTOR, order_blobs
 from liex_lab.scene.background import learn_background
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor, find_floor
@@ -37,10 +35,10 @@ def with_box(
     return depth
 
 
-def recording_of(frames: list[np.ndarray]) -> Recording:
+def recording_of(frames: list[np.ndarray], noise_mm: float = 1.0) -> Recording:
     rng = np.random.default_rng(0)
     noisy = [
-        np.where(f > 0, np.maximum(f + rng.normal(0, 1.0, f.shape), 1), 0).astype(np.float32)
+        np.where(f > 0, np.maximum(f + rng.normal(0, noise_mm, f.shape), 1), 0).astype(np.float32)
         for f in frames
     ]
     return Recording(
@@ -138,15 +136,6 @@ def test_an_empty_frame_is_not_found_and_costs_nothing_else():
     assert scene.extract(stack, 1.0).found.tolist() == [False, True, False]
 
 
-def test_serial_and_parallel_extraction_agree():
-    floor = tilted(5.0)
-    stack = np.stack([with_box(floor, (40 + 10 * k, 50 + 3 * k)) for k in range(6)])
-    scene = BackgroundSubtraction.from_floor(CAMERA, floor)
-    one, two = scene.extract(stack, 1.0, parallel=False), scene.extract(stack, 1.0, parallel=True)
-    np.testing.assert_array_equal(one.heights, two.heights)
-    np.testing.assert_array_equal(one.moments, two.moments)
-
-
 def test_what_else_may_be_the_animal_is_cut_out_in_the_same_go():
     floor = tilted(3.0)
     alone = with_box(floor, (50, 60))
@@ -195,21 +184,3 @@ def test_a_recording_that_shows_no_background_is_told_why(n: int, depth_mm: int,
 
 
 # Which of the components of a picture is likest to the animal.
-
-
-def test_components_come_in_the_order_of_their_areas_distance_and_equal_ones_in_their_own():
-    rng = np.random.default_rng(8)
-    for _ in range(50):
-        n = int(rng.integers(1, MAX_BLOBS + 1))
-        blobs = np.zeros((MAX_BLOBS, N_BLOB))
-        n_px = rng.choice([40.0, 80.0, 120.0, 400.0, 3000.0], n)  # many are alike
-        for slot in range(n):
-            on_floor = n_px[slot] * rng.choice([0.0, 1.0])
-            blobs[slot] = Blob(n_px[slot], 0, 1, 0, 1, n_px[slot] * 1000.0, on_floor)
-        order, n_near = order_blobs(blobs, n, 100.0, 1e-6)
-        stands = blobs[:n, Blob._fields.index("n_on_floor")] > 0
-        off = np.abs(np.log(n_px / 100.0))
-        near = stands & (off <= np.log(AREA_FACTOR))
-        assert n_near == near.sum()
-        expected = np.argsort(np.where(near, off, np.inf), kind="stable")
-        np.testing.assert_array_equal(order, expected)

@@ -9,11 +9,10 @@ import pytest
 
 from liex_lab.optics.camera import SensorCard
 from liex_lab.recordings import open_recording
-from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.learning import learn_scene
 from liex_lab.scene.scene import Fixture
-from tests.scene.test_background_segmenter import CAMERA, SPINES, recording_of, tilted, with_box
+from tests.scene.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 if TYPE_CHECKING:
     from liex_lab.simulation.recording import TrueRecording
@@ -30,7 +29,7 @@ def nodding(k: int) -> np.ndarray:
     return frame
 
 
-@pytest.mark.parametrize("n_frames", [20, 60])
+@pytest.mark.parametrize("n_frames", [20, pytest.param(60, marks=pytest.mark.nightly)])
 def test_an_animal_that_only_turns_its_head_is_found_whole(n_frames):
     scene, sample = learn_scene(recording_of([nodding(k) for k in range(n_frames)]), SPINES)
     crops = scene.extract(sample, 1.0)
@@ -74,7 +73,13 @@ def test_where_nothing_moves_the_floor_is_what_the_animal_lies_on(step_mm):
     assert scene.extract(sample, 1.0).found.all()
 
 
-@pytest.mark.parametrize(("seed", "n_frames"), [(36, 30), (37, 30), (35, 90)])
+@pytest.mark.parametrize(
+    ("seed", "n_frames"),
+    [
+        (36, 30),
+        *(pytest.param(*each, marks=pytest.mark.nightly) for each in ((37, 30), (35, 90))),
+    ],
+)
 def test_of_what_stands_still_in_a_noisy_picture_the_animal_is_what_changes(seed, n_frames):
     """Things stand on the floor beside it, the foot of a wall flickers, and it stays in place."""
     recording = open_recording(
@@ -181,19 +186,6 @@ def test_a_fixture_says_when_it_stands_there_and_is_read_back_as_it_was_written(
 N_READ = 40
 
 
-def card_of(frames: list[np.ndarray]) -> SensorCard:
-    recording = Recording(
-        name="boxes",
-        format="synthetic",
-        camera=CAMERA,
-        times_ns=np.arange(len(frames)) * 33_000_000,
-        read=lambda k: frames[k],
-    )
-    scene, _ = learn_scene(recording, SPINES)
-    assert scene.sensor is not None
-    return scene.sensor
-
-
 def walking(
     noise_mm: float = 0.0, step_mm: float = 0.0, seam_px: int = 0, shelf: bool = False
 ) -> list[np.ndarray]:
@@ -218,27 +210,28 @@ def walking(
     return frames
 
 
-@pytest.mark.parametrize("noise_mm", [0.5, 1.5])
-def test_noise_is_the_spread_of_a_pixel_where_nothing_moves(noise_mm):
-    card = card_of(walking(noise_mm))
-    assert all(sd == pytest.approx(noise_mm, rel=0.1) for _, sd in card.noise)
-    assert card.step_mm is None
-
-
-@pytest.mark.parametrize("step_mm", [1.0, 2.5])
-def test_what_depth_is_rounded_to_is_told(step_mm):
-    assert card_of(walking(2.0, step_mm)).step_mm == pytest.approx(step_mm, abs=0.01)
-
-
-@pytest.mark.parametrize("seam_px", [0, 2])
-def test_the_seam_is_as_wide_as_what_is_unread_around_the_animal(seam_px):
-    assert card_of(walking(0.5, seam_px=seam_px)).seam_px == pytest.approx(seam_px, abs=0.35)
-
-
-def test_readings_between_both_sides_of_an_edge_are_counted():
-    assert card_of(walking(0.5)).mixed_share is None
-    # an edge has two pixels, of which one reads so in a fifth of the frames
-    assert card_of(walking(0.5, shelf=True)).mixed_share == pytest.approx(0.1, abs=0.02)
+@pytest.mark.parametrize(
+    ("faults", "noise_mm", "step_mm", "seam_px", "mixed"),
+    [
+        ({"noise_mm": 0.5}, 0.5, None, 0, None),
+        ({"noise_mm": 1.5, "seam_px": 2}, 1.5, None, 2, None),
+        ({"noise_mm": 2.0, "step_mm": 2.5}, None, 2.5, 0, None),
+        # an edge has two pixels, of which one reads so in a fifth of the frames
+        ({"noise_mm": 0.5, "shelf": True}, None, None, 0, 0.1),
+    ],
+)
+def test_a_sensor_s_noise_steps_seam_and_mixed_readings_are_measured(
+    faults, noise_mm, step_mm, seam_px, mixed
+):
+    scene, _ = learn_scene(recording_of(walking(**faults), noise_mm=0.0), SPINES)
+    card = scene.sensor
+    assert card is not None
+    if noise_mm is not None:
+        assert all(sd == pytest.approx(noise_mm, rel=0.1) for _, sd in card.noise)
+    assert card.step_mm == (None if step_mm is None else pytest.approx(step_mm, abs=0.01))
+    if mixed is None:
+        assert card.seam_px == pytest.approx(seam_px, abs=0.35)
+    assert card.mixed_share == (None if mixed is None else pytest.approx(mixed, abs=0.02))
 
 
 def test_a_card_is_read_back_as_it_was_written_and_says_itself():

@@ -24,7 +24,7 @@ def seen(stage: SimulatedScene, rng: np.random.Generator) -> np.ndarray:
     return np.where(rng.random(noisy.shape) < 0.03, 0, noisy).astype(np.float32)
 
 
-@pytest.mark.parametrize("n", [9, pytest.param(24, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("n", [6, pytest.param(24, marks=pytest.mark.nightly)])
 def test_drawn_arenas_are_found_as_they_are(n: int) -> None:
     """Half of them are cut by the image's edge, a third have things on the floor; the seed is not
     chosen.
@@ -80,7 +80,7 @@ def test_an_open_table_has_no_shape() -> None:
     assert np.isnan(arena.wall_distance_mm(np.zeros((3, 2)))).all()
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(
     x=st.floats(-300, 300),
     y=st.floats(-300, 300),
@@ -99,7 +99,7 @@ def test_a_circle_is_found_though_some_points_are_astray(
     assert off < 0.02 * radius
 
 
-@settings(max_examples=15)
+@settings(max_examples=6)
 @given(yaw=st.floats(-0.7, 0.7), a=st.floats(60, 300), ratio=st.floats(0.5, 1.0))
 def test_a_rectangle_is_found_at_any_angle(yaw: float, a: float, ratio: float) -> None:
     rng = np.random.default_rng(0)
@@ -141,6 +141,7 @@ def test_an_arena_survives_its_own_table(arena: Arena) -> None:
     assert Arena.from_dict(json.loads(json.dumps(arena.to_dict()))) == arena
 
 
+@pytest.mark.nightly
 def test_a_real_round_arena(reference_data: Path) -> None:
     """Its maker's bucket is 17 inches across, which is 216 mm of radius."""
     with open_recording(reference_data / "mouse_kinect2" / "session_20170125.tar.gz") as recording:

@@ -48,6 +48,7 @@ def test_an_animal_that_comes_after_two_thirds_is_found_when_it_comes():
     assert 900.0 < scene.area_mm2 < 2000.0
 
 
+@pytest.mark.nightly
 def test_an_animal_that_leaves_is_found_until_it_leaves():
     busy, empty = filmed()
     _, there = found(np.concatenate([busy[:14], empty[14:]]))
@@ -55,6 +56,7 @@ def test_an_animal_that_leaves_is_found_until_it_leaves():
     assert not there[14:].any()
 
 
+@pytest.mark.nightly
 def test_specks_of_an_edge_that_flickers_are_no_animal_beside_one_that_sleeps():
     busy, empty = filmed()
     asleep = np.where(busy[5:6] > 0, busy[5:6] + empty - empty.mean(axis=0), 0.0)
@@ -65,7 +67,7 @@ def test_specks_of_an_edge_that_flickers_are_no_animal_beside_one_that_sleeps():
     assert 900.0 < scene.area_mm2 < 2000.0
 
 
-@pytest.mark.parametrize("n_asleep", [41, 48])
+@pytest.mark.parametrize("n_asleep", [41, pytest.param(48, marks=pytest.mark.nightly)])
 def test_an_animal_that_sleeps_for_most_or_all_of_the_time_is_found_whole(n_asleep):
     busy, empty = filmed()
     asleep = np.where(busy[5:6] > 0, busy[5:6] + empty - empty.mean(axis=0), 0.0)
@@ -74,6 +76,7 @@ def test_an_animal_that_sleeps_for_most_or_all_of_the_time_is_found_whole(n_asle
     assert 900.0 < scene.area_mm2 < 2000.0
 
 
+@pytest.mark.nightly
 def test_a_resting_thing_larger_than_any_such_animal_is_none():
     _, empty = filmed()
     box = empty.copy()
@@ -82,6 +85,7 @@ def test_a_resting_thing_larger_than_any_such_animal_is_none():
         found(box)
 
 
+@pytest.mark.nightly
 def test_a_house_is_not_taken_for_the_animal_that_comes_late():
     busy, empty = filmed()
     pictures = np.concatenate([empty[:32], busy[32:]])

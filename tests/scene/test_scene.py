@@ -77,24 +77,6 @@ def test_a_plane_that_does_not_face_the_camera_is_no_floor(normal):
         plane_of([0.0, 0.0, 700.0], normal, CAMERA)
 
 
-def test_a_plan_with_a_floor_and_a_region_is_written_and_read_again():
-    plan = Plan.load("mouse").with_settings(
-        [
-            "arena.floor={point = [0.0, 0.0, 700.0], normal = [0.0, 0.1, 1.0]}",
-            "arena.region=[[1.0, 2.0], [30.0, 2.0], [30.0, 40.0]]",
-        ]
-    )
-    assert Plan.from_toml(plan.to_toml()) == plan
-
-
-def test_the_doctor_takes_a_region_and_says_what_is_wrong_with_it(tmp_path):
-    from liex_lab.cli.main import app
-
-    wrong = CliRunner().invoke(app, ["doctor", "synthetic:walk?frames=3", "--region", "1,2 three"])
-    assert wrong.exit_code != 0
-    assert "three or more corners" in f"{wrong.output}{wrong.exception}"
-
-
 @pytest.mark.parametrize(
     ("words", "setting"),
     [

@@ -39,7 +39,17 @@ STAGES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("name", ["an arena on a table", *STAGES])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a small arena 30 mm above the bench",
+        *(
+            pytest.param(name, marks=pytest.mark.nightly)
+            for name in ("an arena on a table", *STAGES)
+            if "30 mm" not in name
+        ),
+    ],
+)
 def test_the_floor_is_where_the_mouse_walks(name):
     mouse = walk(stage(**STAGES[name]), N_FRAMES) if name in STAGES else on_a_table()[0]
     scene, sample = learn_scene(mouse, SPINES, N_FRAMES)
@@ -55,7 +65,7 @@ def test_the_floor_is_where_the_mouse_walks(name):
     assert not scene.support_plane.doubt
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 20.0])
+@pytest.mark.parametrize("tilt_deg", [pytest.param(0.0, marks=pytest.mark.nightly), 20.0])
 def test_an_arena_whose_floor_lies_a_little_above_the_bench_has_its_own_plane(tilt_deg):
     """The largest plane runs between the two, for they are less than a floor's flatness apart."""
     mouse = walk(stage(height_mm=700.0, raised_mm=6.0, wall_mm=60.0, tilt_deg=tilt_deg), N_FRAMES)
@@ -130,7 +140,8 @@ def test_a_scene_in_which_nothing_is_flat_is_refused_in_one_sentence():
         learn_scene(rough, SPINES, 4)
 
 
-@pytest.mark.parametrize("seed", [2027, pytest.param(2048, marks=pytest.mark.nightly)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", [2027, 2048])
 def test_the_back_of_a_mouse_on_unread_floor_is_no_ground(seed: int) -> None:
     """It keeps still but for its head, and all around it the glossy floor is unread."""
     recording = film("glossy", seed, 120, family="train" if seed % 2 == 0 else "other")

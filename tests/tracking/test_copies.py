@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liex_lab.recordings.frame import DepthFrame, marked
@@ -15,6 +15,7 @@ from tests.tracking.stories import SUBJECT, joint_error, noisy, told, walk
 FLOOR = np.full((48, 64), 600.0, np.float32)
 
 
+@settings(max_examples=15)
 @given(st.lists(st.integers(0, 2), min_size=1, max_size=20), st.integers(0, 19), st.integers(1, 6))
 def test_a_frame_repeats_where_it_equals_the_one_before_however_it_is_read(
     values: list[int], first: int, n: int

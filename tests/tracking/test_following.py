@@ -35,7 +35,7 @@ def jerk(track: Track) -> float:
     return float(np.linalg.norm(np.diff(nose, 2, axis=0), axis=1).max() * 30.0)
 
 
-@pytest.mark.parametrize("off", [(0.0, 12.0, 0.0), (8.0, 8.0, 0.0), (0.0, 0.0, 15.0)])
+@pytest.mark.parametrize("off", [(8.0, 8.0, 0.0), (0.0, 0.0, 15.0)])
 def test_neighbours_follow_without_a_spike(off: tuple[float, float, float]) -> None:
     alone, together = (WalkingMouse(steady(4.0)).track() for _ in range(2))
     before = WalkingMouse(steady(4.0)).track()

@@ -47,7 +47,7 @@ def test_a_mouse_that_goes_under_a_roof_is_hidden_until_it_comes_back(seen: Obse
 
 def test_a_mouse_that_is_lost_in_the_open_is_not_found(seen: Observations) -> None:
     seen.behind[:] = 0.0
-    for track in (track_whole(SUBJECT, seen).track, live_track(seen[40:120], 0)):
+    for track in (track_whole(SUBJECT, seen).track, live_track(seen[52:70], 0)):
         rows = np.flatnonzero(np.isin(track.times_ns, seen.times_ns[GONE]))
         assert not (track.flag == "hidden").any()
         assert (track.flag[rows] == "not_found").all()
@@ -75,7 +75,7 @@ def test_the_gap_says_where_the_animal_was_last_seen_and_since_when(seen: Observ
     np.testing.assert_allclose(place, track.centroid_mm[first - 1, :2])
 
 
-@pytest.mark.parametrize("lag", [0, 6])
+@pytest.mark.parametrize("lag", [pytest.param(0, marks=pytest.mark.nightly), 6])
 def test_the_live_track_says_hidden_as_the_whole_recording_does(
     seen: Observations, lag: int
 ) -> None:

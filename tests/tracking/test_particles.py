@@ -61,6 +61,7 @@ def test_before_the_animal_is_found_and_without_a_foreground_there_is_no_estimat
     assert [joints is None for joints in found] == [True, False, True, False]
 
 
+@pytest.mark.nightly
 def test_the_metric_of_a_hand_sees_what_it_has_learned_from():
     """Its residuals against the picture among it: without them it read past the row's end, and the
     hand was lost within some frames.

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from liex_lab.tracking.own_shape import SessionBody, agree, spread_of
@@ -22,6 +22,7 @@ FOUND = st.builds(
 )
 
 
+@settings(max_examples=15)
 @given(found=st.lists(FOUND, min_size=2, max_size=6), rng=st.randoms(use_true_random=False))
 def test_the_order_of_the_sessions_changes_not_a_bit(found, rng):
     shuffled = list(found)
@@ -33,6 +34,7 @@ def test_the_order_of_the_sessions_changes_not_a_bit(found, rng):
         np.testing.assert_array_equal(one.shape, other.shape)
 
 
+@settings(max_examples=15)
 @given(found=st.lists(FOUND, min_size=2, max_size=6))
 def test_what_is_agreed_on_lies_between_what_was_found(found):
     agreed = agree(found)
@@ -56,6 +58,7 @@ def by_hand(lengths: list[float], variances: list[float]) -> float:
     return float(np.exp(np.sum(w * y) / np.sum(w)))
 
 
+@settings(max_examples=15)
 @given(found=st.lists(FOUND, min_size=2, max_size=6))
 def test_the_length_is_the_random_effects_mean(found):
     variances = [max(one.log_sd**2 / one.n_frames, 1e-6) for one in found]

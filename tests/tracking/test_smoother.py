@@ -1,11 +1,9 @@
 """The filter and its way back, against SciPy's matrices and against a dense least-squares twin."""
 
 import numpy as np
-import pytest
 from scipy.linalg import expm
 
 from liex_lab.geometry import so3
-from liex_lab.geometry._kernels import exp_so3, log_so3
 from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking import _smoother_kernels as poses
 
@@ -125,17 +123,6 @@ def test_rotations_about_one_axis_are_smoothed_as_their_angles_are():
     np.testing.assert_allclose(turned, so3.exp(out[:, None] * axis), atol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.4, 2.0, 3.1, np.pi])
-def test_the_scalar_exponential_and_logarithm_are_those_of_the_geometry(angle):
-    w = angle * np.array([2.0, -1.0, 2.0]) / 3.0
-    rotation, back = np.zeros((3, 3)), np.zeros(3)
-    exp_so3(w[0], w[1], w[2], rotation)
-    np.testing.assert_allclose(rotation, so3.exp(w), atol=1e-14)
-    log_so3(rotation, back)
-    np.testing.assert_allclose(so3.exp(back), rotation, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(back), angle, atol=1e-7)
-
-
 def test_weights_are_those_of_a_t_distribution_and_the_gate_leaves_frames_out():
     rng = np.random.default_rng(4)
     seen = rng.normal(0.0, 3.0, (30, 5, 3))
@@ -147,28 +134,3 @@ def test_weights_are_those_of_a_t_distribution_and_the_gate_leaves_frames_out():
     np.testing.assert_array_equal(used, known & (off <= 3.0))
     np.testing.assert_allclose(weight, np.where(known, 5.0 / (4.0 + off**2), 1.0), rtol=1e-12)
     assert 0 < n_used == used.sum() < known.sum()
-
-
-def test_what_is_measured_errs_along_the_animals_own_axes():
-    rng = np.random.default_rng(5)
-    joints, known = rng.normal(0.0, 30.0, (12, 4, 3)), rng.random(12) < 0.7
-    joints[:2, 3] = joints[:2, 0] + [[0.0, 0.0, 20.0], [0.0, 0.0, -20.0]]  # upright, either way
-    known[:2] = True
-    middle, frame = np.empty((12, 3)), np.empty((12, 3, 3))
-    poses.middles(joints, known, 3, middle, frame)
-    np.testing.assert_allclose(middle, joints.mean(axis=1), atol=1e-12)
-    along = joints[known, 3] - joints[known, 0]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    axes = frame[known]
-    np.testing.assert_allclose(axes[:, :, 0], along, atol=1e-12)
-    np.testing.assert_allclose(axes.mT @ axes, np.tile(np.eye(3), (len(axes), 1, 1)), atol=1e-12)
-    np.testing.assert_allclose(axes[:, 2, 1], 0.0, atol=1e-15)  # its side is level
-    error, weight, own = rng.uniform(1.0, 2.0, 12), rng.uniform(0.5, 2.0, 12), np.array([3, 2, 1.0])
-    variance, r = np.full(12, np.inf), np.zeros((12, 3, 3))
-    poses.measured_spread(frame, error, weight, known, own, 0.6, variance, r)
-    expected = 0.64 * error[known] ** 2 / weight[known]
-    np.testing.assert_allclose(variance[known], expected, rtol=1e-12)
-    by_hand = expected[:, None, None] * (axes @ np.diag(own**2) @ axes.mT)
-    np.testing.assert_allclose(r[known], by_hand, rtol=1e-9, atol=1e-12)
-    assert np.isinf(variance[~known]).all()
-    assert not r[~known].any()

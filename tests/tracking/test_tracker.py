@@ -64,15 +64,6 @@ def test_every_frame_has_a_row_and_the_empty_ones_say_why(track, frames):
     assert track.n_foreground_px[[NOTHING, BARE]].tolist() == [0, 0]
 
 
-def test_a_row_is_whole_or_empty(track):
-    for field in fields(Track):
-        values = getattr(track, field.name)
-        if field.name != "skeleton" and values.dtype == np.float64:
-            finite = np.isfinite(values).reshape(track.n_frames, -1)
-            np.testing.assert_array_equal(finite.all(axis=1), track.observed, err_msg=field.name)
-            np.testing.assert_array_equal(finite.any(axis=1), track.observed, err_msg=field.name)
-
-
 def test_joints_lie_near_the_truth_in_the_arena_frame(track, toy):
     off = np.linalg.norm(track.joints_mm - toy.joints, axis=-1).mean(axis=1)
     assert np.nanmedian(off) < 2.0
