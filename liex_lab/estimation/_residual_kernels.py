@@ -124,10 +124,7 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
     camera = crop_camera(packed_camera)
     n = n_own
     per_mm = 1.0 / (size * unit_mm)
-    beside = 0.0
-    off = 0.0
-    out_of = 0.0
-    hidden = 0.0
+    beside = off = out_of = hidden = 0.0
     last = heights.shape[0] - 1
     for b in range(n):
         u, v = to_pixel(camera, balls[b, 0], balls[b, 1], balls[b, 2])
@@ -147,9 +144,7 @@ def explain(heights, packed_camera, balls, radius, n_own, size, unit_mm, out):
     out[OUT_OF] = MM_UNIT * out_of / covered
     out[HIDDEN] = SHARE_UNIT * hidden / n
     n_read = 0
-    far = 0.0
-    apart = 0.0
-    within = 0.0
+    far = apart = within = 0.0
     gaps = np.empty(len(balls))
     for r in range(_STRIDE // 2, last + 1, _STRIDE):
         for c in range(_STRIDE // 2, last + 1, _STRIDE):

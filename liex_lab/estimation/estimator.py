@@ -30,6 +30,7 @@ from liex_lab.estimation import _cascade_kernels as kernels
 from liex_lab.estimation._residual_kernels import SphereModel
 from liex_lab.estimation.cascade import (
     N_DIRECTIONS,
+    Array,
     ImageSet,
     body_of,
     draw_starts,
@@ -48,8 +49,6 @@ from liex_lab.estimation.scoring import Chosen, choose, corrected, with_best, wi
 from liex_lab.forests.forest import Forest
 from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -44,13 +44,11 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as feature_kernels
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels
-from liex_lab.estimation.cascade import Candidates, ImageSet, body_of, residuals
+from liex_lab.estimation.cascade import Array, Candidates, ImageSet, body_of, residuals
 from liex_lab.geometry import SE3
 from liex_lab.mlp import Network, descend
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import mm_per_px
-
-Array = NDArray[np.float64]
 
 _FIRST_STEPS = 1  # of all poses
 # cost of leaving the pose of the regressors, in squares of the unit: a radian of the base, a unit

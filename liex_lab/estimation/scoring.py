@@ -25,15 +25,13 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation.cascade import Candidates, ImageSet
+from liex_lab.estimation.cascade import Array, Candidates, ImageSet
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.geometry import SE3, so3
 from liex_lab.scene.height_maps import mm_per_px, moment_columns
-
-Array = NDArray[np.float64]
 
 LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
 LEAST_MM = 0.1  # least expected error, at the reference length

@@ -27,12 +27,10 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape, Surface
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as kernels
-from liex_lab.estimation.refine import ridge_regression
+from liex_lab.estimation.refine import Array, ridge_regression
 from liex_lab.geometry import SE3
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import mm_per_px
-
-Array = NDArray[np.float64]
 
 N_STATIONS = 22
 N_LATERAL = 24

@@ -27,6 +27,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.cascade import (
     N_DIRECTIONS,
+    Array,
     Candidates,
     Cascade,
     TrainingSet,
@@ -58,7 +59,6 @@ from liex_lab.forests.grow import GrowthPlan, boost_forest, grow_forest
 from liex_lab.geometry import SE3, so3
 from liex_lab.scene.height_maps import HeightMaps, crop_columns
 
-Array = NDArray[np.float64]
 ProgressCallback = Callable[[float, str], None]  # completed share, name of the step
 
 

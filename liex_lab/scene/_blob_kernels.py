@@ -187,8 +187,7 @@ def layers(depth, limit, labels, slot, blob, apart):
         if ordered[k] - ordered[k - 1] > gap:
             gap = ordered[k] - ordered[k - 1]
             cut = 0.5 * (ordered[k] + ordered[k - 1])
-    near = 0.0
-    far = 0.0
+    near = far = 0.0
     for z in ordered:
         near += BLOCK * BLOCK * z * z * (z < cut)
         far += BLOCK * BLOCK * z * z * (z >= cut)
@@ -218,10 +217,8 @@ def _is_unread(depth, row, column):
 def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, packed):
     """Flood fill: blocks connected with (i, j) get the label `slot`, and `packed` their counts."""
     n_px = 0
-    first_row = i
-    last_row = i
-    first_column = j
-    last_column = j
+    first_row = last_row = i
+    first_column = last_column = j
     depth_sum = 0.0
     n_on_floor = 0
     top = 1
@@ -360,8 +357,7 @@ def keep_largest(raw, runs):
     n = 0
     parent = runs[:, 4]
     # the first run of the row above, and of the one above that
-    above = 0
-    higher = 0
+    above = higher = 0
     for r in range(1, size - 1):
         begin = n
         for c in range(1, size - 1):
@@ -463,8 +459,7 @@ def smooth_heights(raw, radius, out):
     background = np.zeros((size + 1, size + 1), np.int32)
     for r in range(max(top - radius - 1, 0), min(bottom + radius + 2, size)):
         row_total = 0.0
-        row_animal = 0
-        row_background = 0
+        row_animal = row_background = 0
         for c in range(size):
             value = raw[r, c]
             row_total += value if value >= 0.0 else 0.0
@@ -507,13 +502,7 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
             and across it, and 0, reserved for `back_slope`. All 0 for an empty map.
     """
     n = 0
-    area = 0.0
-    volume = 0.0
-    sx = 0.0
-    sy = 0.0
-    sxx = 0.0
-    sxy = 0.0
-    syy = 0.0
+    area = volume = sx = sy = sxx = sxy = syy = 0.0
     fx = intrinsics[0]
     fy = intrinsics[1]
     cx = intrinsics[2]
@@ -594,15 +583,10 @@ def back_slope(heights, origin, step, intrinsics, distance, moments):
                 along[n] = c * (x - moments[X]) + s * (y - moments[Y])
                 height[n] = heights[r, k] / 16.0
                 n += 1
-    level = 0.0
-    slope = 0.0
+    level = slope = 0.0
     scale = np.inf
     for _ in range(5):
-        sw = 0.0
-        sx = 0.0
-        sh = 0.0
-        sxx = 0.0
-        sxh = 0.0
+        sw = sx = sh = sxx = sxh = 0.0
         for i in range(n):
             off = (height[i] - level - slope * along[i]) / scale
             w = 1.0 / (1.0 + off * off) ** 2
@@ -616,8 +600,7 @@ def back_slope(heights, origin, step, intrinsics, distance, moments):
             return slope
         slope = (sw * sxh - sx * sh) / spread
         level = (sh - slope * sx) / sw
-        total = 0.0
-        weight = 0.0
+        total = weight = 0.0
         for i in range(n):
             off = abs(height[i] - level - slope * along[i])
             w = 1.0 if scale == np.inf else 1.0 / (1.0 + (off / scale) ** 2)

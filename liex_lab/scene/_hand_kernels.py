@@ -66,11 +66,8 @@ def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
     """
     n_rows, n_columns = labels.shape
     focal = np.sqrt(intrinsics[0] * intrinsics[1])
-    area = 0.0
-    around = 0.0
-    behind = 0.0
-    on_border = 0
-    n = 0
+    area = around = behind = 0.0
+    on_border = n = 0
     depth = 0.0
     cells = surface.cells
     for k in range(len(cells)):
@@ -177,8 +174,7 @@ def locate(blocks, labels, surface, tip, size, intrinsics):
     around = AROUND_MM * size
     focal2 = intrinsics[0] * intrinsics[1]
     cut = -1e9
-    area = 0.0
-    base = 0.0
+    area = base = 0.0
     near = np.empty((len(surface.cells), _N_POINT))
     # the step of mean shift, before any cut
     tips = near[: _within(surface, 60.0 * size, middle, near)]  # of a home-sized hand, mm
@@ -262,10 +258,7 @@ def _beyond(points, middle, fingers, cut, labels, mark):
     """Move `middle` (3,) to the middle of the blocks beyond the cut, optionally marked in labels;
     returns the sum of z^2.
     """
-    total = 0.0
-    x = 0.0
-    y = 0.0
-    z = 0.0
+    total = x = y = z = 0.0
     for n in range(len(points)):
         if _along(points[n], middle, fingers) > cut:
             w = points[n, _POINT_Z] * points[n, _POINT_Z]

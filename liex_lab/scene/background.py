@@ -24,7 +24,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.memory import check_shapes
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene import _height_map_kernels as kernels
-from liex_lab.scene.floor import Floor, near_plane, parts
+from liex_lab.scene.floor import Array, Depths, Floor, Mask, near_plane, parts
 from liex_lab.scene.support_plane import (
     SampledScene,
     SupportPlane,
@@ -152,10 +152,6 @@ def learn_background(
 # The floor's level while a sensor warms up: the measured depth of the same floor drifts.
 
 
-Array = NDArray[np.float64]
-Depths = NDArray[np.float32]
-
-
 @dataclass(frozen=True)
 class FloorLevel:
     """Pixels of the floor and their initial depth, as a reference for depth drift.
@@ -252,8 +248,6 @@ def wandering(levels: Array) -> tuple[float, float] | None:
 
 # Floor that is never read: the mirror image of the camera in a glossy floor, dark patches.
 
-
-Mask = NDArray[np.bool_]
 
 _FLAT_MM = 15.0  # distance from the plane
 

@@ -32,15 +32,11 @@ from liex_lab.scene.background import (
     FloorLevel,
     SceneChange,
 )
-from liex_lab.scene.floor import Floor
+from liex_lab.scene.floor import Array, Depths, Floor, Mask
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, pack_crop_cameras, size_misfit
 from liex_lab.scene.scene import Fixture, Scene, find_fixtures, region_corners, roughness
 from liex_lab.scene.support_plane import SupportPlane
 from liex_lab.scene.worn import Cable, Worn
-
-Array = NDArray[np.float64]
-Depths = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 AnyNumber = TypeVar("AnyNumber", bound=np.generic)
 

@@ -25,6 +25,7 @@ from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 
 Array = NDArray[np.float64]
+Depths = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 # pixels that vote for a plane, and planes tried

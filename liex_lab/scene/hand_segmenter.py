@@ -24,7 +24,7 @@ from liex_lab.runtime.memory import check_shapes
 from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene import _hand_kernels as kernels
 from liex_lab.scene.background import sample_frames
-from liex_lab.scene.floor import Floor
+from liex_lab.scene.floor import Array, Floor
 from liex_lab.scene.height_maps import (
     CROP,
     HeightMaps,
@@ -34,8 +34,6 @@ from liex_lab.scene.height_maps import (
     size_misfit,
     view_of,
 )
-
-Array = NDArray[np.float64]
 
 RANGE_MM = (250.0, 1600.0)  # least and largest depth of a hand
 _FLAT = np.array([0.0, 0.0, 1.0])  # perpendicular to the optical axis

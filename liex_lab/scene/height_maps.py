@@ -29,7 +29,7 @@ from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import N_MOMENTS, BlobMoments
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA, CropCamera, CropRows
-from liex_lab.scene.floor import Floor
+from liex_lab.scene.floor import Array, Floor
 
 __all__ = [
     "N_CROP_CAMERA",
@@ -42,7 +42,6 @@ __all__ = [
     "view_of",
 ]
 
-Array = NDArray[np.float64]
 _ROTATION = slice(CropCamera._fields.index("r00"), CropCamera._fields.index("r22") + 1)
 
 

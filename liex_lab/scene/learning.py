@@ -36,7 +36,7 @@ from liex_lab.scene.background import (
     stride_for,
 )
 from liex_lab.scene.background_segmenter import BackgroundSubtraction as Scene
-from liex_lab.scene.floor import Floor, parts
+from liex_lab.scene.floor import Array, Depths, Floor, Mask, parts
 from liex_lab.scene.scene import HIGH_MM, LEAST_MM2, Fixture, fixture_at
 from liex_lab.scene.support_plane import TargetAnimal
 from liex_lab.scene.worn import find_worn
@@ -45,9 +45,6 @@ from liex_lab.scene.worn import find_worn
 Resting: TypeAlias = "tuple[Scene, float, bool]"
 # an object's first frame, the frame after its last, its pixels and their depth (H, W)
 _Transient: TypeAlias = "tuple[int, int, Mask, Depths]"
-Array = NDArray[np.float64]
-Depths = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 _LEAST_FRAMES = 6  # least frames of the sample with it, and without it

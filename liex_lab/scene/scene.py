@@ -23,10 +23,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera, SensorCard
-from liex_lab.scene.floor import Floor, floor_patch, parts
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from liex_lab.scene.floor import Array, Floor, Mask, floor_patch, parts
 
 ROUND = "round"
 RECTANGULAR = "rectangular"

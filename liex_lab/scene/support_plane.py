@@ -20,6 +20,7 @@ from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.processes import side_by_side
 from liex_lab.scene.floor import (
+    Array,
     FlatGround,
     Floor,
     components,
@@ -30,8 +31,6 @@ from liex_lab.scene.floor import (
     floor_region,
 )
 from liex_lab.scene.scene import BY_SUPPORT, LARGEST, STATED, WALLED
-
-Array = NDArray[np.float64]
 
 _AROUND_PX = 5  # radius of the ground inspected around an object
 _MIN_MOVERS = 5  # fewer moving objects are no evidence

@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import check_shapes
 from liex_lab.runtime.processes import side_by_side
-from liex_lab.scene.floor import Floor, components
+from liex_lab.scene.floor import Depths, Floor, Mask, components
 from liex_lab.scene.support_plane import TargetAnimal
 
-Depths = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 _SQUARE = np.ones((3, 3), np.uint8)
 
 

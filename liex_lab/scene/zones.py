@@ -27,10 +27,9 @@ from liex_lab.optics.camera import Camera
 from liex_lab.plan.sections import Circle, Corner, Region, SettingsTable
 from liex_lab.recordings.frame import region_mask
 from liex_lab.runtime.text_files import read_toml
-from liex_lab.scene.floor import Floor
+from liex_lab.scene.floor import Array, Floor
 from liex_lab.scene.scene import Arena, Mask, circle_points
 
-Array = NDArray[np.float64]
 Corners = tuple[tuple[float, float], ...]
 
 

@@ -91,8 +91,7 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
         Nats, from 0 to the ceiling.
     """
     n = joints_a.shape[0]
-    shift = 0.0
-    bend = 0.0
+    shift = bend = 0.0
     middle = np.zeros(3)
     for j in range(n):
         for k in range(3):
@@ -272,8 +271,7 @@ def forward_backward(times, one, two, error, evidence, costs, doubt):
         first[t] -= top
         second[t] -= top
     # backward pass
-    a = 0.0
-    b = 0.0
+    a = b = 0.0
     for t in range(n - 1, -1, -1):
         doubt[t] = 1.0 / (1.0 + np.exp(min(first[t] + a - second[t] - b, 700.0)))
         if t > 0:

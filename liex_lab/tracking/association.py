@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking import _association_kernels as kernels
-from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.observations import Array, Observations
 from liex_lab.tracking.smoother import AssociationCosts
 from liex_lab.tracking.trust import head_tail_weight, together, usual_pixels
-
-Array = NDArray[np.float64]
 
 _BLOCK = 16_384  # frames in memory at once
 _BESIDE = 256  # and context frames, for velocities

@@ -31,7 +31,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.recordings.timestamps import GAP_FACTOR, median_step
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation, cost_of_the_other
-from liex_lab.tracking.observations import Observations, reversed_pose
+from liex_lab.tracking.observations import Array, Observations, reversed_pose
 from liex_lab.tracking.smoother import TrackingParameters, smooth
 from liex_lab.tracking.track import (
     Flip,
@@ -122,8 +122,6 @@ def repeat_messages(
             )
     return reasons, cautions
 
-
-Array = NDArray[np.float64]
 
 # frames smoothed at once, and context frames on either side
 _BLOCK = 4096

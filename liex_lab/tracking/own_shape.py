@@ -29,10 +29,8 @@ from liex_lab.estimation.session_shape import (
     session_clues,
 )
 from liex_lab.scene.height_maps import Segmenter, view_of
-from liex_lab.tracking.residual import BodyResidual
+from liex_lab.tracking.residual import Array, BodyResidual
 from liex_lab.tracking.trust import finite_median
-
-Array = NDArray[np.float64]
 
 FEWEST_FRAMES = 50
 

@@ -20,16 +20,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.estimation.cascade import Candidates, ImageSet
+from liex_lab.estimation.cascade import Array, Candidates, ImageSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.geometry import SE3, brownian_ends, brownian_steps, so3
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.scene.height_maps import Segmenter, view_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

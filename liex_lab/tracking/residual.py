@@ -33,10 +33,8 @@ from liex_lab.geometry import SE3
 from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.height_maps import CROP, HeightMaps, Segmenter
-from liex_lab.tracking.observations import joints_of
+from liex_lab.tracking.observations import Array, joints_of
 from liex_lab.tracking.trust import MOST_ERROR, MOST_RESIDUAL, finite_median
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -203,9 +201,7 @@ def _compare(rendered, heights, origin, step, planes, distance, joints, out, sta
         offset = np.empty(size * size)
         own = np.empty(size * size)
         part = np.empty(size * size, np.int64)
-        n = 0
-        n_read = 0
-        n_drawn = 0
+        n = n_read = n_drawn = 0
         for r in range(size):
             v = origin[i, 1] + step[i] * r
             for c in range(size):
@@ -426,8 +422,7 @@ def _share_behind(heights, origin, step, depths, nearer_mm, reach_px, out, start
     """Fill out (n,) with the share of the edges of each height map (n, S, S) behind an object."""
     for i in range(start, stop):
         size = heights.shape[1]
-        n_edges = 0
-        n_behind = 0
+        n_edges = n_behind = 0
         for r in range(1, size - 1):
             v = origin[i, 1] + step[i] * r
             for c in range(1, size - 1):
@@ -584,10 +579,8 @@ def _look(heights, origin, step, distance, depths, ends, before, out, start, sto
         depth = depths[i]
         line = ends[i, 1] - ends[i, 0]
         squared = max(line[0] ** 2 + line[1] ** 2, 1.0)
-        n = 0
-        covered = 0
-        aside = 0.0
-        middle = 0.0
+        n = covered = 0
+        aside = middle = 0.0
         first = np.inf
         last = -np.inf
         for r in range(size):

@@ -30,22 +30,21 @@ of any test.
 from __future__ import annotations
 
 import tomllib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 
 from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.tracking import _smoother_kernels as kernels
-from liex_lab.tracking.observations import joints_of
+from liex_lab.tracking.observations import Array, joints_of
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 TUNINGS = Path(__file__).with_name("tunings.toml")
 # fields of `MotionParameters` with another name in the file, kept for compatibility
@@ -89,8 +88,7 @@ class AssociationCosts:
     tail: float
 
 
-@dataclass(frozen=True)
-class OrnsteinUhlenbeck:
+class OrnsteinUhlenbeck(NamedTuple):
     """Integrated Ornstein-Uhlenbeck and measurement-error parameters of one coordinate.
 
     Attributes:
@@ -219,11 +217,10 @@ class TrackingParameters:
                 coordinate are error, drive (process variance) and fade (decay time).
         """
         field_of = {stored: name for name, stored in _STORED_AS.items()}
-        motion = {field_of.get(key, key): _frozen(value) for key, value in table["motion"].items()}
-        for group in ("turn", "bend"):
-            motion[group] = tuple(OrnsteinUhlenbeck(*row) for row in motion[group])
-        motion["size"] = OrnsteinUhlenbeck(*motion["size"])
-        return TrackingParameters(AssociationCosts(**table["chain"]), MotionParameters(**motion))
+        motion = {field_of.get(key, key): value for key, value in table["motion"].items()}
+        return TypeAdapter(TrackingParameters).validate_python(
+            {"chain": table["chain"], "motion": motion}
+        )
 
     def to_toml(self, name: str) -> str:
         """The parameters as TOML tables, numbers to four significant digits.
@@ -234,16 +231,12 @@ class TrackingParameters:
         Returns:
             The text of `[name.chain]` and `[name.motion]`.
         """
-        lines = [
-            f"[{name}.chain]",
-            *(f"{key} = {_text(value)}" for key, value in asdict(self.chain).items()),
-        ]
-        lines += ["", f"[{name}.motion]"]
-        for key, value in asdict(self.motion).items():
-            rows = [list(row.values()) for row in value] if key in ("turn", "bend") else value
-            rows = list(value.values()) if key == "size" else rows
-            lines.append(f"{_STORED_AS.get(key, key)} = {_text(rows)}")
-        return "\n".join(lines) + "\n"
+        chain = (f"{key} = {_text(value)}" for key, value in vars(self.chain).items())
+        motion = (
+            f"{_STORED_AS.get(key, key)} = {_text(value)}"
+            for key, value in vars(self.motion).items()
+        )
+        return "\n".join([f"[{name}.chain]", *chain, "", f"[{name}.motion]", *motion, ""])
 
 
 def tunings_with(name: str, tuning: TrackingParameters) -> str:
@@ -265,11 +258,6 @@ def tunings_with(name: str, tuning: TrackingParameters) -> str:
     return "\n".join(
         [head.rstrip("\n") + "\n", *(each.to_toml(animal) for animal, each in known.items())]
     )
-
-
-def _frozen(value: Any) -> Any:
-    """A value of a TOML table with tuples in place of lists."""
-    return tuple(map(_frozen, value)) if isinstance(value, list) else value
 
 
 def _text(value: Any) -> str:

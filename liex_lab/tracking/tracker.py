@@ -28,7 +28,7 @@ from liex_lab.scene.background import has_noise
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.height_maps import HeightMaps, Patches, Segmenter
 from liex_lab.tracking.curve import track_whole
-from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.observations import Array, Observations
 from liex_lab.tracking.own_shape import OwnShape, StatedShape, fit_shape
 from liex_lab.tracking.residual import (
     BodyAgreement,
@@ -363,9 +363,6 @@ def _count(
 
 
 # Pose hypotheses of patches of depth around animals, like `FrameTracker.observe` of frames.
-
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

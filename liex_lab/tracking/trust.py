@@ -24,11 +24,9 @@ from numpy.typing import NDArray
 
 from liex_lab.geometry import so3
 from liex_lab.tracking._association_kernels import NONE
-from liex_lab.tracking.observations import Observations, joints_of
+from liex_lab.tracking.observations import Array, Observations, joints_of
 from liex_lab.tracking.smoother import SmoothedCurve, TrackingParameters
 from liex_lab.tracking.track import Subject, Track, short_gaps, spans
-
-Array = NDArray[np.float64]
 
 # of the animal's length
 MOST_ERROR = 0.25
