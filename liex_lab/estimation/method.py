@@ -7,14 +7,18 @@ trees, depths, learned metric) are those of Lie-X sections 4 and 5.2 as far as s
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
 
 from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.errors import PlanError
 from liex_lab.forests.grow import GrowthPlan
+
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]  # NaN is none
+Count = Annotated[int, Field(strict=True, ge=0, le=10_000)]
 
 
 @dataclass(frozen=True)
@@ -69,41 +73,45 @@ class Method:
         tells_facing: a head-tail classifier decides if the metric is unsure, see `refine`.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
     variant: str
-    rounds: int  # C
-    n_candidates: int  # Kt
+    rounds: Annotated[int, Field(strict=True, ge=1, le=10_000)]  # C
+    n_candidates: Annotated[int, Field(strict=True, ge=1, le=10_000)]  # Kt
     training_candidates: int  # K initial poses per training image
     regressors: GrowthPlan
     metric: GrowthPlan
-    reach_mm: float  # range of the features' offsets from the joint
+    reach_mm: Number  # range of the features' offsets from the joint
     axis_start: bool  # start along the animal's long axis, in both directions; else any heading
     camera_view: bool  # depth along the optical axis, as the paper; else height above the floor
     session_size: bool  # the animal's size is estimated over the recording; else home size
     regress_scale: bool  # the base joint also corrects the bones' scale
     point_at: bool  # labels aim the bone at the true next joint
-    keep_turned: float  # base: train on samples rotated by less than this
-    keep_bent: float  # other joints: train on smaller corrections than this
-    keep_off_mm: float  # other joints: train on samples within this distance
+    keep_turned: Number  # base: train on samples rotated by less than this
+    keep_bent: Number  # other joints: train on smaller corrections than this
+    keep_off_mm: Number  # other joints: train on samples within this distance
     out_of_bag: bool  # move a training sample only with trees not grown on its image
     metric_on_own: bool  # train the metric on the cascade's own candidates; else on perturbed truth
-    metric_shrinkage: float  # of each boosting stage of the metric; 0 grows a plain forest
-    mean_shift_mm: float  # bandwidth of the mode over tree votes; 0 averages them
-    top_k: int  # averaged candidates; 1 uses the best one
-    top_tau: float  # decay of weights with the predicted error, mm
-    top_radius_mm: float  # only candidates within this of the best one are averaged
-    base_lever_mm: float = 30.0  # rotations weigh as much as translations at this arm
-    joint_lever_mm: float = 20.0
-    scale_lever_mm: float = 50.0
-    survivors: int = 0  # candidates kept after the base joint; 0: all of them
+    metric_shrinkage: Number  # of each boosting stage of the metric; 0 grows a plain forest
+    mean_shift_mm: Number  # bandwidth of the mode over tree votes; 0 averages them
+    top_k: Annotated[
+        int, Field(strict=True, ge=1, le=10_000)
+    ]  # averaged candidates; 1 uses the best one
+    top_tau: Number  # decay of weights with the predicted error, mm
+    top_radius_mm: Number  # only candidates within this of the best one are averaged
+    base_lever_mm: Number = 30.0  # rotations weigh as much as translations at this arm
+    joint_lever_mm: Number = 20.0
+    scale_lever_mm: Number = 50.0
+    survivors: Count = 0  # candidates kept after the base joint; 0: all of them
     # of the small metric that chooses them; None: no such metric is trained
     pruner: GrowthPlan | None = None
     # ridge correction of the chosen pose of an animal that is one chain
     settle: bool = False
     # range of offsets from the base joint; 0: as from the others
-    base_reach_mm: float = 0.0
+    base_reach_mm: Number = 0.0
     # of the forest correction of the chosen pose; None: no correction
     corrector: GrowthPlan | None = None
-    home_turn: tuple[float, ...] = (
+    home_turn: tuple[Number, ...] = (
         0.0,
         0.0,
         0.0,
@@ -111,12 +119,12 @@ class Method:
     # trees that propose starts, for an animal of any orientation
     proposals: GrowthPlan | None = None
     # range of their features' offsets from the animal's centre
-    proposal_reach_mm: float = 0.0
+    proposal_reach_mm: Number = 0.0
     # rounds of the base joint if they differ from the others'; 0: as many
-    base_rounds: int = 0
-    refine_steps: int = 0  # Gauss-Newton steps of the refinement
+    base_rounds: Count = 0
+    refine_steps: Count = 0  # Gauss-Newton steps of the refinement
     # candidates refined in addition to the mean of the best; the best fit is chosen
-    refined: int = 0
+    refined: Count = 0
     explains: bool = False  # the metric also uses the residuals of the posed body
     # a network separates head from tail if the metric is unsure, see `refine`
     tells_facing: bool = False
@@ -149,20 +157,6 @@ class Method:
             for name, value in asdict(self).items()
             if name not in _UNSET or value != _UNSET[name]
         }
-
-    @staticmethod
-    def from_dict(values: dict[str, Any]) -> Method:
-        """The method of a model file.
-
-        Args:
-            values: plain values, as from `to_dict`.
-        """
-        plain = dict(values)
-        plain["home_turn"] = tuple(plain.get("home_turn", _UNSET["home_turn"]))
-        for name in _PLANS:
-            if plain.get(name):
-                plain[name] = GrowthPlan(**plain[name])
-        return Method(**plain)
 
 
 _PLANS = ("regressors", "metric", "pruner", "corrector", "proposals")

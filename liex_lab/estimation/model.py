@@ -13,26 +13,28 @@ import io
 import json
 import lzma
 import zipfile
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import ModelError
 from liex_lab.estimation._feature_kernels import N_SCALARS
 from liex_lab.estimation._residual_kernels import N_FIT
 from liex_lab.estimation.cascade import Cascade
-from liex_lab.estimation.method import Method
+from liex_lab.estimation.method import Method, Number
 from liex_lab.estimation.refine import N_OTHERS
 from liex_lab.forests._kernels import number_nodes
 from liex_lab.forests.forest import Forest, check_forest, check_roots
 from liex_lab.mlp import Network, check_layers
 from liex_lab.runtime.memory import check_npz
 
+Part = TypeVar("Part")
 N_CLUES = 22  # of `scoring.clue_samples`, the residuals apart
 SCHEMA = 3  # of a model with a head-tail classifier; 2 of one without
 # after the regressors, if present
@@ -69,13 +71,15 @@ class ErrorCalibration:
         logarithmic: the expectation forest predicts LOG_UNIT times the logarithm of the error.
     """
 
-    offset: float = 0.0
-    slope: float = 1.0
-    spread_slope: float = 0.0
-    quantiles: tuple[float, float] = (0.5, 2.0)
-    joint_share: tuple[float, ...] = ()
-    doubtful_mm: float = 10.0
-    area_mm2: float = 1300.0
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+    offset: Number = 0.0
+    slope: Number = 1.0
+    spread_slope: Number = 0.0
+    quantiles: tuple[Number, Number] = (0.5, 2.0)
+    joint_share: tuple[Number, ...] = ()
+    doubtful_mm: Number = 10.0
+    area_mm2: Number = 1300.0
     logarithmic: bool = False
 
 
@@ -196,11 +200,8 @@ class Model:
                     for k in range(n_layers)
                 ]
                 facing = Network.plain(layers) if f"{_LAYER}0_bias" in archive.files else None
-            method = Method.from_dict(head["method"])
-            values = head["calibration"]
-            for name in ("quantiles", "joint_share"):
-                values[name] = tuple(values[name])
-            calibration = ErrorCalibration(**values)
+            method = _checked(Method, head["method"])
+            calibration = _checked(ErrorCalibration, head["calibration"])
             table, card = head["skeleton"], head["card"]
         except FileNotFoundError:
             raise ModelError(
@@ -212,8 +213,6 @@ class Model:
             ) from None
         skeleton = Skeleton.from_table(table, str(path))
         rounds = [method.rounds_of(joint) for joint in skeleton.solved]
-        if any(type(n) is not int or n < 1 for n in rounds):
-            raise ModelError(f"{path} states {rounds} rounds for its joints; train it again")
         n_regressors = sum(rounds)
         # schema 1 did not state it
         extra = head.get("forests", _FORESTS[: len(forests) - n_regressors])
@@ -284,17 +283,7 @@ def check_model(model: Model) -> None:
                 check_forest(forest, *sizes)
             except ValueError as error:
                 raise ValueError(f"forest {name}: {error}") from None
-    for where, part in (("method", method), ("calibration", model.calibration)):
-        for one in fields(part):
-            value = getattr(part, one.name)
-            if one.type == "float" and type(value) not in (float, int):
-                raise ValueError(f"{one.name} of its {where} is {value!r}, not a number")
-        _check_numbers(f"its {where}", vars(part))
-    for name, least in _COUNTS.items():
-        count = getattr(method, name)
-        if type(count) is not int or not least <= count <= _MOST:
-            raise ValueError(f"{name} of its method is {count!r}, not {least} to {_MOST}")
-    if len(model.calibration.joint_share) not in (0, j) or len(model.calibration.quantiles) != 2:
+    if len(model.calibration.joint_share) not in (0, j):
         raise ValueError(f"its calibration is not of {j} joints")
     settler = model.settler
     if settler is not None and not (
@@ -312,32 +301,16 @@ def check_model(model: Model) -> None:
             raise ValueError(f"a sphere of its body is on none of the {j} joints")
 
 
-def _check_numbers(where: str, values: Any) -> None:
-    """Raise ValueError for a number, at any depth of tables and lists, that is NaN, infinite or
-    implausibly large.
-    """
-    if isinstance(values, float | int) and not abs(values) <= 1e12:
-        raise ValueError(f"{where} contains the number {values}")
-    inner = getattr(values, "__dict__", values)
-    if isinstance(inner, dict):
-        inner = inner.values()
-    elif not isinstance(inner, list | tuple):
-        return
-    for value in inner:
-        _check_numbers(where, value)
+def _checked(kind: type[Part], values: Any) -> Part:
+    """A part of the head of a model file; ValueError names its first field that is wrong."""
+    try:
+        return TypeAdapter(kind).validate_python(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{where} of its {kind.__name__}: {first['msg']}") from None
 
 
-_MOST = 10_000
-# least value of each count
-_COUNTS = {
-    "rounds": 1,
-    "n_candidates": 1,
-    "top_k": 1,
-    "survivors": 0,
-    "base_rounds": 0,
-    "refine_steps": 0,
-    "refined": 0,
-}
 _LAYER = "facing_"
 _LAYER_PARTS = ("weights", "bias")
 
