@@ -5,16 +5,6 @@ from pathlib import Path
 import liex_lab
 from liex_lab.plan.study import Study
 from tests.conftest import REPOSITORY
-from tests.sessions.walking_mouse import WalkingMouse, steady, write
-
-
-def test_a_session_says_its_animal_its_length_and_its_tables(tmp_path: Path) -> None:
-    session = write(tmp_path / "circle.liex", WalkingMouse(steady(2.0)))
-    said = repr(session)
-    assert said.startswith("<Session circle: mouse, 60 frames; tables activity, bouts")
-    for name in ("frames", "poses", "kinematics"):
-        assert name in said
-        assert len(session.table(name))
 
 
 def test_a_plan_says_what_is_unlike_the_defaults() -> None:

@@ -59,8 +59,7 @@ def place_balls(rotations, positions, scale, body, out):
     """
     for b in range(len(body.joints)):
         share = body.share[b]
-        one = body.joints[b, 0]
-        other = body.joints[b, 1]
+        one, other = body.joints[b, 0], body.joints[b, 1]
         for i in range(3):
             first = positions[one, i]
             second = positions[other, i]

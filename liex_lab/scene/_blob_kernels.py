@@ -228,9 +228,7 @@ def _flood(depth, limit, on_floor, bridge, labels, i, j, slot, stack, packed):
     labels[i, j] = slot
     while top > 0:
         top -= 1
-        row = stack[top, 0]
-        column = stack[top, 1]
-        gone = stack[top, 2]
+        row, column, gone = stack[top, 0], stack[top, 1], stack[top, 2]
         if gone == 0:
             first_row = min(first_row, row)
             last_row = max(last_row, row)
@@ -309,9 +307,7 @@ def cut_heights(depth, limit, labels, slot, plane, distance, origin, step, raw):
     """
     size = raw.shape[0]
     height, width = depth.shape
-    a = plane[0]
-    b = plane[1]
-    c0 = plane[2]
+    a, b, c0 = plane[0], plane[1], plane[2]
     for r in range(size):
         v = origin[1] + step * r
         for c in range(size):
@@ -503,10 +499,7 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
     """
     n = 0
     area = volume = sx = sy = sxx = sxy = syy = 0.0
-    fx = intrinsics[0]
-    fy = intrinsics[1]
-    cx = intrinsics[2]
-    cy = intrinsics[3]
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     for r in range(1, heights.shape[0] - 1):
         v = origin[1] + step * r
         for c in range(1, heights.shape[1] - 1):

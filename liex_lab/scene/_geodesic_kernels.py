@@ -119,8 +119,7 @@ def label_surfaces(blocks, labels, focal2, least_mm2, areas):
             top = 1
             area = 0.0
             while at < top:
-                r = stack[at, 0]
-                c = stack[at, 1]
+                r, c = stack[at, 0], stack[at, 1]
                 at += 1
                 here = blocks[r, c]
                 area += BLOCK * BLOCK * here * here / focal2
@@ -218,8 +217,7 @@ def walk(blocks, labels, surface, position, order, hops):
     last_j = labels.shape[1] - 1
     cells = surface.cells
     for k in range(len(cells)):
-        i = cells[k, 0]
-        j = cells[k, 1]
+        i, j = cells[k, 0], cells[k, 1]
         nearest = min(nearest, blocks[i, j])
         if blocks[i, j] > deepest:
             deepest = blocks[i, j]
@@ -229,8 +227,7 @@ def walk(blocks, labels, surface, position, order, hops):
     # a hand may touch the border, too; the arm is farther away
     arm = 0.5 * (nearest + far_border)
     for k in range(len(cells)):
-        i = cells[k, 0]
-        j = cells[k, 1]
+        i, j = cells[k, 0], cells[k, 1]
         if min(i, j, last_i - i, last_j - j) < _MARGIN and blocks[i, j] >= arm:
             order[n, 0] = i
             order[n, 1] = j
@@ -238,8 +235,7 @@ def walk(blocks, labels, surface, position, order, hops):
             position[i, j] = n
             n += 1
     if n == 0:
-        i = cells[farthest, 0]
-        j = cells[farthest, 1]
+        i, j = cells[farthest, 0], cells[farthest, 1]
         return walk_from(blocks, labels, surface.slot, i, j, position, order, hops)
     return _spread(blocks, labels, surface.slot, n, position, order, hops)
 
@@ -273,8 +269,7 @@ def _spread(blocks, labels, slot, n, position, order, hops):
     """Breadth-first search from the first n blocks; returns the final number of blocks."""
     at = 0
     while at < n:
-        i = order[at, 0]
-        j = order[at, 1]
+        i, j = order[at, 0], order[at, 1]
         for a in range(max(i - 1, 0), min(i + 2, labels.shape[0])):
             for b in range(max(j - 1, 0), min(j + 2, labels.shape[1])):
                 if position[a, b] >= 0 or labels[a, b] != slot:
@@ -312,8 +307,7 @@ def ends(blocks, order, hops, position, n, focal, least_mm, tips, n_tips):
     """
     parent = np.arange(n)
     for k in range(n - 1, -1, -1):
-        i = order[k, 0]
-        j = order[k, 1]
+        i, j = order[k, 0], order[k, 1]
         mine = k
         for a in range(max(i - 1, 0), min(i + 2, blocks.shape[0])):
             for b in range(max(j - 1, 0), min(j + 2, blocks.shape[1])):
@@ -394,8 +388,7 @@ def nearest_ends(blocks, labels, surfaces, size, intrinsics, chosen):
             if blocks[order[k, 0], order[k, 1]] < blocks[order[nearest, 0], order[nearest, 1]]:
                 nearest = k
             position[order[k, 0], order[k, 1]] = -1
-        i = order[nearest, 0]
-        j = order[nearest, 1]
+        i, j = order[nearest, 0], order[nearest, 1]
         n_tips = _note(tips, n_tips, blocks[i, j], 0.5, order[nearest])
         n = walk_from(blocks, labels, surface.slot, last_i, last_j, position, order, hops)
         n_tips = ends(blocks, order, hops, position, n, focal, _STICKS_OUT_MM * size, tips, n_tips)

@@ -71,8 +71,7 @@ def unlikeness(blocks, labels, surface, mark, found, size, intrinsics):
     depth = 0.0
     cells = surface.cells
     for k in range(len(cells)):
-        i = cells[k, 0]
-        j = cells[k, 1]
+        i, j = cells[k, 0], cells[k, 1]
         side = _side(blocks[i, j], focal)
         if labels[i, j] != mark:
             behind += side * side * _behind_cut(surface.points[k], found, size)
@@ -108,9 +107,7 @@ def _side(depth, focal):
 @inner_kernel()
 def _behind_cut(point, found, size):
     """Whether a point (3,) lies close behind the cut through the arm."""
-    x = point[0]
-    y = point[1]
-    z = point[2]
+    x, y, z = point[0], point[1], point[2]
     fingers = found.fingers
     middle = found.middle
     along = x * fingers[0] + y * fingers[1] + z * fingers[2] - found.cut
@@ -196,9 +193,7 @@ def _within(surface, radius, middle, near):
     points = surface.points
     n = 0
     for k in range(len(points)):
-        x = points[k, 0]
-        y = points[k, 1]
-        z = points[k, 2]
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
         off2 = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 + (z - middle[2]) ** 2
         if off2 < radius * radius:
             near[n, _POINT_X] = x
@@ -329,8 +324,7 @@ def box_of(labels, surface, mark, box):
     box[3] = -1
     cells = surface.cells
     for k in range(len(cells)):
-        i = cells[k, 0]
-        j = cells[k, 1]
+        i, j = cells[k, 0], cells[k, 1]
         if labels[i, j] == mark:
             box[0], box[1] = min(box[0], i), max(box[1], i)
             box[2], box[3] = min(box[2], j), max(box[3], j)

@@ -401,7 +401,17 @@ class BareGround:
             EstimationError: no depth was read, no depth recurs often enough, or no floor was found.
         """
         scene = sampled_scene(sample, camera, target)
-        _check_background(sample, scene.background)
+        n = len(sample)
+        if not (sample > 0).any():
+            raise EstimationError(
+                f"no depth was read in {n} frames spread over the recording; check the camera, its "
+                "range and its cable"
+            )
+        if not (scene.background > 0).any():
+            raise EstimationError(
+                "the background, the depth that recurs in each pixel, cannot be learned from "
+                f"{n} frame{'' if n == 1 else 's'}; record at least a few seconds"
+            )
         plane = find_support_plane(scene, stated)
         if region is not None:
             plane = replace(plane, region=region, on_floor=plane.on_floor & region)
@@ -494,18 +504,3 @@ class BareGround:
         behind = np.where(on_floor, background, scene.near)
         margin = np.maximum(np.float32(target.min_height_mm), np.float32(SPREADS) * spread)
         return background, np.maximum(behind - margin, 0).astype(np.float32)
-
-
-def _check_background(sample: Depths, background: Depths) -> None:
-    """Refuse a sample (n, H, W) mm from which no background (H, W) mm can be learned."""
-    n = len(sample)
-    if not (sample > 0).any():
-        raise EstimationError(
-            f"no depth was read in {n} frames spread over the recording; check the camera, its "
-            "range and its cable"
-        )
-    if not (background > 0).any():
-        raise EstimationError(
-            "the background, the depth that recurs in each pixel, cannot be learned from "
-            f"{n} frame{'' if n == 1 else 's'}; record at least a few seconds"
-        )

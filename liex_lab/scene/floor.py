@@ -100,8 +100,7 @@ class Floor:
 
     def lens_distance_mm(self, lift_mm: Array | None = None) -> float:
         """Distance of the plane from the real lens, mm; `lift_mm` as in `unusual`."""
-        up = 0.0 if lift_mm is None else float(lift_mm @ self.normal)
-        return self.distance_mm - up
+        return self.distance_mm - (0.0 if lift_mm is None else float(lift_mm @ self.normal))
 
     def unusual(self, lift_mm: Array | None = None) -> list[str]:
         """How the camera's position differs from those in the training data, a sentence each.
@@ -110,20 +109,20 @@ class Floor:
             lift_mm: (3,) from the real lens to the camera's origin, mm, of the ideal camera above
                 water; None without water.
         """
-        found = []
         distance = self.lens_distance_mm(lift_mm)
-        low, high = 150.0, 3000.0  # of the cameras in the training data
-        if not low <= distance <= high:
-            found.append(
-                f"the floor lies {distance:.0f} mm from the camera, outside the usual {low:.0f} to "
-                f"{high:.0f} mm; check the unit and the camera's height"
-            )
-        if self.tilt_rad > math.radians(15.0):
-            found.append(
+        differences = (  # from the cameras in the training data
+            (
+                not 150.0 <= distance <= 3000.0,
+                f"the floor lies {distance:.0f} mm from the camera, outside the usual 150 to "
+                "3000 mm; check the unit and the camera's height",
+            ),
+            (
+                self.tilt_rad > math.radians(15.0),
                 f"the camera looks down at {math.degrees(self.tilt_rad):.0f} degrees from "
-                "straight, and poses are learned up to 10; turn it to look straight down"
-            )
-        return found
+                "straight, and poses are learned up to 10; turn it to look straight down",
+            ),
+        )
+        return [sentence for differs, sentence in differences if differs]
 
     def inverse_at(self, u: NDArray[Any], v: NDArray[Any]) -> Array:
         """1 / depth of the plane in pixels (u, v), 1/mm."""

@@ -36,7 +36,6 @@ __all__ = [
     "CropCamera",
     "crop_columns",
     "in_camera_frame",
-    "in_view_frame",
     "mm_per_px",
     "pack_crop_cameras",
     "view_of",
@@ -123,20 +122,6 @@ def in_camera_frame(points: Array, crop_cameras: Array) -> Array:
     """
     offset = points - _camera_centre(points, crop_cameras)
     return np.einsum("nji,n...j->n...i", _rotations(crop_cameras), offset)
-
-
-def in_view_frame(points: Array, crop_cameras: Array) -> Array:
-    """The inverse of `in_camera_frame`.
-
-    Args:
-        points: (n, ..., 3) mm, camera frames.
-        crop_cameras: (n, 17).
-
-    Returns:
-        (n, ..., 3) mm, view frames.
-    """
-    turned = np.einsum("nij,n...j->n...i", _rotations(crop_cameras), points)
-    return turned + _camera_centre(points, crop_cameras)
 
 
 def _camera_centre(points: Array, crop_cameras: Array) -> Array:

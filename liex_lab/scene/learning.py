@@ -283,8 +283,10 @@ def _changing_lump(scene: Scene, sample: Depths, target: TargetAnimal) -> Restin
     free = []
     for lump in _lumps(scene, target):
         near = _around(lump)
+        edge = near & ~lump
+        off = np.abs(scene.bare - scene.background)[edge]
         # of its edge is bare floor; half for the foot of a wall
-        if _free(scene, near & ~lump, target) >= 0.75:
+        if (scene.on_floor[edge] & (off < target.min_height_mm)).mean() >= 0.75:
             free.append((_change(scene, sample, near, target), lump, near))
     for _, lump, near in sorted(free, key=lambda one: -one[0])[:16]:
         whole = _with_floor_at(scene, near, target)
@@ -327,12 +329,6 @@ def _lumps(scene: Scene, target: TargetAnimal) -> Iterator[Mask]:
     above = scene.bare - scene.background
     raised = scene.on_floor & (scene.background > 0) & (above > target.min_height_mm)
     return parts(raised, 16)
-
-
-def _free(scene: Scene, edge: Mask, target: TargetAnimal) -> float:
-    """The share of a lump's edge (H, W) that is bare floor, 0 to 1."""
-    off = np.abs(scene.bare - scene.background)[edge]
-    return float((scene.on_floor[edge] & (off < target.min_height_mm)).mean())
 
 
 def _around(lump: Mask) -> Mask:

@@ -25,9 +25,6 @@ from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera, SensorCard
 from liex_lab.scene.floor import Array, Floor, Mask, floor_patch, parts
 
-ROUND = "round"
-RECTANGULAR = "rectangular"
-IRREGULAR = "irregular"
 OPEN = "open"
 _BORDER_PX = 8  # outline this near to the image border is not the floor's own
 _FIT_MM = 4.0  # largest residual of a fitted shape, or 2.5 % of its size
@@ -143,12 +140,12 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
     middle, half, yaw, off_rectangle = fit_rectangle(points)
     size = float(np.sqrt(np.prod(half)))
     if min(off_circle, off_rectangle) > max(_FIT_MM, 0.025 * size):
-        return Arena(IRREGULAR, seen_share=share, edge=edge)
+        return Arena("irregular", seen_share=share, edge=edge)
     if off_circle <= off_rectangle:
-        return Arena(ROUND, _pair(centre), radius, None, None, off_circle, share, edge)
+        return Arena("round", _pair(centre), radius, None, None, off_circle, share, edge)
     if not _all_sides_in_view(points, middle, half, yaw):
         return Arena(OPEN, seen_share=share, edge=edge)
-    return Arena(RECTANGULAR, _pair(middle), None, _pair(half), yaw, off_rectangle, share, edge)
+    return Arena("rectangular", _pair(middle), None, _pair(half), yaw, off_rectangle, share, edge)
 
 
 def _outline(

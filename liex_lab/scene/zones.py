@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
@@ -194,13 +194,7 @@ class Zone:
     @staticmethod
     def from_dict(numbers: dict[str, Any]) -> Zone:
         """The zone that `to_dict` wrote."""
-        circle = numbers.get("circle_mm")
-        polygon = numbers.get("polygon_mm")
-        return Zone(
-            str(numbers["name"]),
-            None if circle is None else (float(circle[0]), float(circle[1]), float(circle[2])),
-            None if polygon is None else _pairs(np.array(polygon, float)),
-        )
+        return TypeAdapter(Zone).validate_python(numbers)
 
 
 def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:

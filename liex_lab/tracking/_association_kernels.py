@@ -110,54 +110,6 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
     return min(costs.tail * np.log1p(cost / costs.tail), most)
 
 
-@kernel()
-def extend(t, chains, n_beam, seen, costs):
-    """One Viterbi step: add frame t and its hypotheses to the beam; returns the beam's size.
-
-    A chain may begin at any frame and skips a frame at its missed-detection cost.
-
-    Args:
-        t: index of the frame.
-        chains: `Chains`, updated in place.
-        n_beam: number of beam rows in use.
-        seen: `Hypotheses`.
-        costs: `TransitionCosts`.
-
-    Returns:
-        Number of beam rows in use afterwards.
-    """
-    cost = chains.cost
-    parent = chains.parent
-    missed_cost = seen.missed_cost
-    for h in range(seen.joints.shape[1]):
-        cost[t, h] = np.inf
-        parent[t, h, 0] = NONE
-        parent[t, h, 1] = NONE
-        if not np.isfinite(seen.emission[t, h]):
-            continue
-        best = missed_cost[t]  # the chain begins here
-        for k in range(n_beam):
-            a = chains.beam[k, 0]
-            g = chains.beam[k, 1]
-            so_far = cost[a, g] + missed_cost[t] - missed_cost[a + 1]
-            if so_far >= best and parent[t, h, 0] != NONE:
-                continue
-            transition = transition_cost(
-                seen.joints[a, g],
-                seen.joints[t, h],
-                seen.error[a, g],
-                seen.error[t, h],
-                seen.times[t] - seen.times[a],
-                costs,
-            )
-            if so_far + transition < best:
-                best = so_far + transition
-                parent[t, h, 0] = a
-                parent[t, h, 1] = g
-        cost[t, h] = best + seen.emission[t, h]
-    return _keep_best(t, chains, n_beam, missed_cost)
-
-
 @inner_kernel()
 def _keep_best(t, chains, n_beam, missed_cost):
     """Prune: keep the best chains after frame t in the beam, best first; returns their number."""
@@ -170,8 +122,7 @@ def _keep_best(t, chains, n_beam, missed_cost):
     n = 0
     for k in range(n_beam + n_hypotheses):
         if k < n_beam:
-            a = beam[k, 0]
-            h = beam[k, 1]
+            a, h = beam[k, 0], beam[k, 1]
         else:
             a = t
             h = k - n_beam
@@ -196,7 +147,9 @@ def _keep_best(t, chains, n_beam, missed_cost):
 
 @kernel()
 def extend_all(start, stop, chains, n_beam, seen, costs):
-    """Viterbi over frames start to stop: `extend` for each; returns the beam's size.
+    """Viterbi over frames start to stop: add each with its hypotheses to the beam.
+
+    A chain may begin at any frame and skips a frame at its missed-detection cost.
 
     Args:
         start: first frame.
@@ -209,8 +162,36 @@ def extend_all(start, stop, chains, n_beam, seen, costs):
     Returns:
         Number of beam rows in use afterwards.
     """
+    cost = chains.cost
+    parent = chains.parent
+    missed_cost = seen.missed_cost
     for t in range(start, stop):
-        n_beam = extend(t, chains, n_beam, seen, costs)
+        for h in range(seen.joints.shape[1]):
+            cost[t, h] = np.inf
+            parent[t, h, 0] = NONE
+            parent[t, h, 1] = NONE
+            if not np.isfinite(seen.emission[t, h]):
+                continue
+            best = missed_cost[t]  # the chain begins here
+            for k in range(n_beam):
+                a, g = chains.beam[k, 0], chains.beam[k, 1]
+                so_far = cost[a, g] + missed_cost[t] - missed_cost[a + 1]
+                if so_far >= best and parent[t, h, 0] != NONE:
+                    continue
+                transition = transition_cost(
+                    seen.joints[a, g],
+                    seen.joints[t, h],
+                    seen.error[a, g],
+                    seen.error[t, h],
+                    seen.times[t] - seen.times[a],
+                    costs,
+                )
+                if so_far + transition < best:
+                    best = so_far + transition
+                    parent[t, h, 0] = a
+                    parent[t, h, 1] = g
+            cost[t, h] = best + seen.emission[t, h]
+        n_beam = _keep_best(t, chains, n_beam, missed_cost)
     return n_beam
 
 

@@ -249,23 +249,6 @@ def _copy(a, out):
 
 
 @kernel()
-def steps(times, tau, decay, gain_dt):
-    """Fill the decay a and the velocity gain g of the step that leads to each frame.
-
-    Args:
-        times: (n,) s.
-        tau: decay time τ, s.
-        decay: (n,) output, a = exp(-dt / τ); 1 at the first frame.
-        gain_dt: (n,) output, g = τ (1 - a), s; 0 at the first frame.
-    """
-    decay[0] = 1.0
-    gain_dt[0] = 0.0
-    for t in range(1, times.size):
-        decay[t] = np.exp(-(times[t] - times[t - 1]) / tau)
-        gain_dt[t] = tau * (1.0 - decay[t])
-
-
-@kernel()
 def gains(times, r, q, tau, start, gain, covariances):
     """Fill Kalman gains, RTS gains and covariances of one scalar coordinate over n frames.
 
@@ -284,7 +267,11 @@ def gains(times, r, q, tau, start, gain, covariances):
     decay, gain_dt, kalman_gain, rts_gain = gain
     filtered, predicted, smoothed = covariances
     p = np.empty((2, 2))
-    steps(times, tau, decay, gain_dt)
+    decay[0] = 1.0
+    gain_dt[0] = 0.0
+    for t in range(1, n):
+        decay[t] = np.exp(-(times[t] - times[t - 1]) / tau)
+        gain_dt[t] = tau * (1.0 - decay[t])
     for t in range(start, n):
         if t == start:
             p[0, 0] = r[t]
@@ -297,8 +284,7 @@ def gains(times, r, q, tau, start, gain, covariances):
         else:
             k = decay[t]
             g = gain_dt[t]
-            a = p[0, 0]
-            b = p[0, 1]
+            a, b = p[0, 0], p[0, 1]
             c = p[1, 1]
             p[0, 0] = a + 2 * g * b + g * g * c + q * _value_variance(times[t] - times[t - 1], tau)
             p[0, 1] = k * (b + g * c) + q * 0.5 * g * g
@@ -309,8 +295,7 @@ def gains(times, r, q, tau, start, gain, covariances):
             kalman_gain[t, 0] = p[0, 0] / s
             kalman_gain[t, 1] = p[0, 1] / s
             if np.isfinite(r[t]):
-                k0 = kalman_gain[t, 0]
-                k1 = kalman_gain[t, 1]
+                k0, k1 = kalman_gain[t, 0], kalman_gain[t, 1]
                 p[1, 1] -= k1 * p[0, 1]
                 p[0, 1] = (1 - k0) * p[0, 1]
                 p[0, 0] = (1 - k0) * p[0, 0]

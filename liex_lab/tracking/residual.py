@@ -337,32 +337,34 @@ class SampleFit:
         Returns:
             Parts of a sentence, such as 'it is 743 mm long and the plan expects 130 to 220 mm'.
         """
-        found = []
-        if not stated and not self.has_length(low_mm, high_mm):
-            found.append(
+        apart = (
+            "its body and what was read hardly overlap"
+            if np.isnan(self.residual_mm)
+            else f"its body lies {self.residual_mm:.0f} mm from what was read"
+        )
+        contradictions = (
+            (
+                not stated and not self.has_length(low_mm, high_mm),
                 f"it is {self.spine_mm:.0f} mm long and the plan expects {low_mm:g} to "
-                f"{high_mm:g} mm"
-            )
-        if self.n_found < 0.05 * self.n_frames:
-            found.append(
-                f"something of its size was found in {self.n_found} of {self.n_frames} frames"
-            )
-        if self.error_mm > MOST_ERROR * self.spine_mm:
-            found.append(
+                f"{high_mm:g} mm",
+            ),
+            (
+                self.n_found < 0.05 * self.n_frames,
+                f"something of its size was found in {self.n_found} of {self.n_frames} frames",
+            ),
+            (
+                self.error_mm > MOST_ERROR * self.spine_mm,
                 f"the expected error of {self.error_mm:.0f} mm is "
-                f"{self.error_mm / self.spine_mm:.0%} of its length"
-            )
-        if not self.residual_mm <= MOST_RESIDUAL * self.spine_mm:
-            found.append(
-                "its body and what was read hardly overlap"
-                if np.isnan(self.residual_mm)
-                else f"its body lies {self.residual_mm:.0f} mm from what was read"
-            )
-        if self.covered < 0.4:
-            found.append(f"its body covers {self.covered:.0%} of the outline that is seen")
-        if self.beside > _MOST_BESIDE:
-            found.append(f"{self.beside:.0%} of its body lies beside that outline")
-        return found
+                f"{self.error_mm / self.spine_mm:.0%} of its length",
+            ),
+            (not self.residual_mm <= MOST_RESIDUAL * self.spine_mm, apart),
+            (self.covered < 0.4, f"its body covers {self.covered:.0%} of the observed outline"),
+            (
+                self.beside > _MOST_BESIDE,
+                f"{self.beside:.0%} of its body lies beside that outline",
+            ),
+        )
+        return [sentence for contradicts, sentence in contradictions if contradicts]
 
 
 def count_animals(

@@ -237,18 +237,6 @@ def drawn_candidates(n: int, k: int, seed: int) -> tuple[Skeleton, Pose, np.ndar
     return skeleton, pose, frames.rotation, frames.translation
 
 
-def test_the_mean_of_candidates_that_are_all_alike_is_that_candidate():
-    skeleton, pose, rotations, positions = drawn_candidates(10, 1, seed=3)
-    scores = np.random.default_rng(4).uniform(1, 9, (10, 12))
-    turned, placed = (np.repeat(values, 12, axis=1) for values in (rotations, positions))
-    picked = choose(skeleton, METHODS["default"], ErrorCalibration(), 1.0, turned, placed, scores)
-    np.testing.assert_allclose(picked.pose.joints(skeleton), positions[:, 0], atol=1e-9)
-    np.testing.assert_allclose(picked.pose.angles, pose.angles[:, 0], atol=1e-7)
-    np.testing.assert_allclose(picked.pose.scale, pose.scale[:, 0], rtol=1e-12)
-    np.testing.assert_allclose(picked.spread, 0.0, atol=1e-7)
-    np.testing.assert_allclose(picked.sd_angles, 0.0, atol=1e-6)
-
-
 def test_the_mean_weighs_by_score_and_leaves_out_what_lies_far_from_the_best():
     skeleton, _, rotations, positions = drawn_candidates(1, 1, seed=5)
     method = replace(METHODS["default"], top_k=3, top_tau=1.0, top_radius_mm=15.0)

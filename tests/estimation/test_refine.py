@@ -107,20 +107,6 @@ def test_joints_stay_within_their_limits_and_hinges_on_their_axes() -> None:
     assert (after.angles[:, 0] == 0.0).all()
 
 
-def test_the_pose_that_came_in_is_left_as_it_was() -> None:
-    crops, crop_cameras, true = hands()
-    kept = true.angles.copy(), true.root.translation.copy()
-    refined(true, crops.heights, crop_cameras, 1.0, 2)
-    np.testing.assert_array_equal(true.angles, kept[0])
-    np.testing.assert_array_equal(true.root.translation, kept[1])
-
-
-def test_a_picture_of_nothing_moves_nothing_far() -> None:
-    crops, crop_cameras, true = hands()
-    after = refined(true, np.zeros_like(crops.heights), crop_cameras, 1.0, 8)
-    np.testing.assert_allclose(after.joints(HAND), true.joints(HAND), atol=1e-6)
-
-
 def test_of_several_poses_the_one_is_taken_that_lies_best_in_the_picture() -> None:
     crops, crop_cameras, true = hands()
     poses = [alone(shaken(true, 5, 6.0)), alone(true), alone(shaken(true, 6, 6.0))]
@@ -179,23 +165,6 @@ def middles(root: SE3, angles: np.ndarray, scale: float) -> np.ndarray:
     return out
 
 
-def test_forward_kinematics_agrees_with_the_bodys_own() -> None:
-    _, _, pose = hands()
-    rotations, positions = np.empty((HAND.n_joints, 3, 3)), np.empty((HAND.n_joints, 3))
-    kernels.forward(
-        REFINER.tree,
-        pose.root.rotation[3],
-        pose.root.translation[3],
-        pose.angles[3],
-        1.1,
-        rotations,
-        positions,
-    )
-    frames = Pose(pose.root, pose.angles, np.full(len(pose.scale), 1.1)).frames(HAND)
-    np.testing.assert_allclose(rotations, frames.rotation[3], atol=1e-12)
-    np.testing.assert_allclose(positions, frames.translation[3], atol=1e-9)
-
-
 @pytest.mark.parametrize("k", [0, 5, 11])
 def test_slopes_are_those_of_small_steps(k: int) -> None:
     _, _, pose = hands()
@@ -239,21 +208,6 @@ def test_the_nearest_reading_is_the_nearest() -> None:
     for r, c in np.argwhere(crops.heights[2] == 0)[::7]:
         kernels.nearest_reading(crops.heights[2], r, c, known)
         np.testing.assert_allclose(np.hypot(*(known[r, c] - [r, c])), true[r, c])
-
-
-def test_nothing_is_nearest_where_nothing_is() -> None:
-    known = np.full((96, 96, 2), -1, np.int32)
-    kernels.nearest_reading(np.zeros((96, 96), np.int16), 3, 90, known)
-    assert known[3, 90, 0] == -2
-
-
-def test_small_systems_are_solved() -> None:
-    rng = np.random.default_rng(0)
-    half = rng.normal(0, 1, (9, 9))
-    matrix, gradient, step = half @ half.T + np.eye(9), rng.normal(0, 1, 9), np.empty(9)
-    assert kernels._solve(np.tril(matrix), gradient, step)
-    np.testing.assert_allclose(matrix @ step, -gradient, atol=1e-9)
-    assert not kernels._solve(-np.eye(9), gradient, step)
 
 
 def test_a_chain_is_refined_as_well() -> None:

@@ -19,7 +19,6 @@ from liex_lab.estimation.session_shape import (
     ShapePrior,
     built,
     cross_sections,
-    labels_of,
     session_clues,
 )
 from liex_lab.scene.height_maps import view_of
@@ -134,25 +133,6 @@ def test_the_bundled_shapes_were_learned_for_the_bundled_model():
     assert prior.model == model.fingerprint
     assert prior.table.shape == (prior.bounds.shape[1] + 1, 3 * 21 + 2 * len(PLACES))
     assert ShapePrior.of("snake") is None
-
-
-def test_labels_come_back_as_a_build(toy):
-    """Through a regression that knows one answer alone."""
-    rng = np.random.default_rng(8)
-    offset = rng.normal(0, 0.01, (5, 3))
-    wide, high = rng.uniform(0.7, 1.4, (2, len(PLACES)))
-    labels = labels_of(offset, wide, high)
-    clues = session_clues_of(toy)
-    n = len(clues)
-    prior = ShapePrior(
-        np.tile([[-9.0], [9.0]], n),
-        np.vstack([np.zeros((n, len(labels))), labels]),
-        np.full(len(labels), 0.1),
-    )
-    told = Build.of(prior, prior.predict(clues))
-    np.testing.assert_allclose(told.offset, offset, atol=1e-8)
-    np.testing.assert_allclose(told.width, wide, rtol=1e-8)
-    np.testing.assert_allclose(told.height, high, rtol=1e-8)
 
 
 def session_clues_of(toy: Toy) -> np.ndarray:

@@ -197,7 +197,8 @@ def test_a_picture_without_a_hand_holds_none() -> None:
         HandSegmenter.learn(blank, HAND.view)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.nightly
+@pytest.mark.parametrize("seed", range(6))
 def test_ends_agree_with_what_a_reader_would_count(seed: int) -> None:
     """Random blots: their ends and how far each sticks out, by the definition of persistence."""
     rng = np.random.default_rng(seed)

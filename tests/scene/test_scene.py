@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import EstimationError, PlanError
 from liex_lab.plan import Plan
-from liex_lab.recordings.frame import region_mask
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.scene import find_fixtures, plane_of
 from tests.scene.staged import CAMERA, on_a_table, shown
@@ -58,19 +57,6 @@ def test_a_floor_that_nothing_stands_on_is_refused():
         seen("arena.floor={point = [0, 0, 1180], normal = [0, 0, 1]}")
 
 
-@pytest.mark.parametrize(
-    ("corners", "message"),
-    [
-        ([[400, 300], [500, 300], [500, 400]], "outside the image"),
-        ([[10, 10], [90, 90], [50, 50]], "encloses 0 pixels"),
-        ([[10, 10], [90, 90]], "three or more corners"),
-    ],
-)
-def test_a_region_that_is_none_is_refused_in_one_sentence(corners, message):
-    with pytest.raises(PlanError, match=message):
-        region_mask(corners, CAMERA.width, CAMERA.height)
-
-
 @pytest.mark.parametrize("normal", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
 def test_a_plane_that_does_not_face_the_camera_is_no_floor(normal):
     with pytest.raises(PlanError, match="a plane in front of the camera that faces it"):
@@ -111,26 +97,6 @@ def test_the_doctor_looks_within_a_circle_of_millimetres_and_says_where_it_is_no
     outside = CliRunner().invoke(app, ["doctor", walk, "--region", "circle 9000,0 150 mm"])
     told = " ".join(f"{outside.output}{outside.exception}".split())
     assert "arena.region lies outside the image" in told
-
-
-@pytest.mark.parametrize("command", ["doctor", "run"])
-def test_a_preset_of_another_resolution_is_told_by_the_commands(command, tmp_path):
-    from liex_lab.cli.main import app
-
-    said = CliRunner().invoke(
-        app,
-        [
-            command,
-            "synthetic:walk?frames=3",
-            *("--set", "camera.preset=azure-nfov"),
-            *(["--out", str(tmp_path)] if command == "run" else []),
-        ],
-    )
-    assert said.exit_code != 0
-    told = " ".join(f"{said.output}{said.exception}".split())
-    assert "has images of 640 x 576 px, but these have 512 x 424" in told
-    assert "Traceback" not in told
-    assert not list(tmp_path.iterdir())
 
 
 def test_rough_ground_is_told_by_its_spread():

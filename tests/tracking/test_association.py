@@ -167,9 +167,3 @@ def test_head_and_tail_of_one_of_two_animals_are_told_as_those_of_a_lone_one():
     seen.score[:, [0, 2]], seen.score[:, [1, 3]] = seen.score[:, [1, 3]], seen.score[:, [0, 2]]
     path = path_of(HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2), seen)
     assert (path % 2 == 1).all()
-
-
-def test_one_animal_is_associated_as_ever_whatever_is_said_of_their_number():
-    seen = told(CLOCK, walk(CLOCK), flipped=np.arange(20) == 12)
-    several = HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 3)
-    np.testing.assert_array_equal(path_of(several, seen), path_of(CHAIN, seen))

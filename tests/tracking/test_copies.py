@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liex_lab.recordings.frame import DepthFrame, marked
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import has_noise
 from liex_lab.tracking.curve import polled_twice, repeat_messages, track_whole
@@ -35,13 +34,6 @@ def test_a_frame_repeats_where_it_equals_the_one_before_however_it_is_read(
     read = [frame.repeats for chunk in recording.chunks(n, first) for frame in chunk]
     assert read == by_hand[first:]
     assert [f.index for f in recording.frames(first)] == [*range(len(values))][first:]
-
-
-def test_one_pixel_that_differs_is_another_image() -> None:
-    other = FLOOR.copy()
-    other[17, 23] += 1.0
-    frames = [DepthFrame(k, k, image) for k, image in enumerate((FLOOR, other, other.copy()))]
-    assert [frame.repeats for frame in marked(frames)] == [False, False, True]
 
 
 def scene(kind: str, n: int = 40) -> np.ndarray:

@@ -9,12 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from liex_lab.body.pose import Pose
-from liex_lab.body.skeleton import Skeleton
-from liex_lab.geometry import SE3, so3
+from liex_lab.geometry import so3
 from liex_lab.runtime.memory import on_disk
 from liex_lab.tracking.curve import OnlineTracker, track_whole
-from liex_lab.tracking.observations import Observations, joints_of, reversed_pose
+from liex_lab.tracking.observations import Observations, joints_of
 from liex_lab.tracking.smoother import SmoothedCurve
 from liex_lab.tracking.track import Flip, Track, ends_of, short_gaps, spans, whole_gaps
 from liex_lab.tracking.trust import covariance_of_root, single_frames
@@ -305,25 +303,8 @@ def test_gaps_are_measured_in_seconds_between_measurements():
     assert not whole_gaps(seconds, measured, 0.29).any()
 
 
-def test_quick_joints_are_the_joints(measured):
-    skeleton = Skeleton.load("hand")
-    rng = np.random.default_rng(1)
-    angles = rng.normal(0.0, 0.6, (9, skeleton.n_joints, 3)) * skeleton.axes
-    angles[:, 0] = 0.0
-    root = SE3.exp(rng.normal(0.0, 1.0, (9, 6)))
-    for body, pose in ((skeleton, Pose(root, angles, np.full(9, 1.3))), (MOUSE, measured)):
-        np.testing.assert_allclose(joints_of(body, pose), pose.joints(body), atol=1e-9)
-
-
 def test_spans_are_the_stretches_of_true():
     assert spans(np.array([True, False, True, True])) == [(0, 1), (2, 4)]
-
-
-def test_a_body_turned_round_twice_lies_as_before(truth):
-    again = reversed_pose(MOUSE, reversed_pose(MOUSE, truth))
-    assert joint_error(again.joints(MOUSE), truth).max() < 0.5
-    ends = reversed_pose(MOUSE, truth).joints(MOUSE)
-    np.testing.assert_allclose(ends[:, 0], truth.joints(MOUSE)[:, -1], atol=0.5)
 
 
 @pytest.mark.parametrize("n_animals", [1, 2])

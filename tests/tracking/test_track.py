@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.tracking.track import FLAGS, Track
+from liex_lab.tracking.track import Track
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, steady
 
 COLUMNS = [field.name for field in fields(Track) if field.name != "skeleton"]
@@ -28,13 +28,6 @@ def test_an_empty_track_has_a_row_for_every_frame_and_nothing_in_it(animal):
         if values.dtype == np.float64:
             assert np.isnan(values).all(), name
     assert np.isnan(track.spine_mm).all()
-
-
-def test_every_flag_fits_into_a_track():
-    track = Track.empty(Skeleton.load("mouse"), np.arange(len(FLAGS)))
-    for k, word in enumerate(FLAGS):
-        track.flag[k] = word
-    assert track.flag.tolist() == list(FLAGS)
 
 
 @pytest.mark.parametrize("stops", [(30,), (1, 30), (7, 8, 21, 30)])

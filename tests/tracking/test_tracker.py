@@ -155,14 +155,6 @@ def test_a_frame_is_doubtful_where_more_error_is_expected_than_allowed(toy, scen
     assert strict.flag[[NOTHING, BARE]].tolist() == ["no_depth", "not_found"]
 
 
-def test_the_models_own_limit_of_doubt_grows_with_the_animal(toy, scene):
-    model = trained("default").model
-    model = replace(model, calibration=replace(model.calibration, doubtful_mm=3.0))
-    for spine in (HOME_MM, 2 * HOME_MM):
-        tracker = FrameTracker.prepare(PoseEstimator(model), scene, toy.depths, spine_mm=spine)
-        assert tracker.doubtful_mm == pytest.approx(3.0 * spine / HOME_MM, rel=1e-4)
-
-
 @pytest.mark.parametrize("spine_mm", [None, 55.0])
 def test_a_sample_without_an_animal_is_refused_in_one_sentence(toy, scene, spine_mm):
     bare = np.stack([FLOOR.depth(CAMERA.width, CAMERA.height)] * 5)
