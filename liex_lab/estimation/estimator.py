@@ -454,7 +454,7 @@ class PoseEstimator:
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:
         """Estimate the animal's size from a sample of frames of the recording.
 
-        The area seen from above gives the first guess. The model then measures the spine in every
+        The area from above gives the first guess. The model then measures the spine in every
         frame, and the median over the most reliable frames becomes the next guess; this is repeated
         eight times, since each pass corrects about a third of the error. The forest correction is
         not used: it has learned the usual proportions and would bias the size towards them.

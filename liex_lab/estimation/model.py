@@ -67,7 +67,7 @@ class ErrorCalibration:
         quantiles: (2,) the 5 % and 95 % quantiles of the ratio of true to predicted error.
         joint_share: (J,) each joint's error over the mean; empty: 1 for every joint.
         doubtful_mm: a predicted error above this, mm at home size, is flagged.
-        area_mm2: usual area of a home-sized animal seen from above, mm^2.
+        area_mm2: usual area of a home-sized animal from above, mm^2.
         logarithmic: the expectation forest predicts LOG_UNIT times the logarithm of the error.
     """
 

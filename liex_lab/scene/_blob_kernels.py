@@ -49,7 +49,7 @@ class BlobMoments(NamedTuple):
 
     Attributes:
         n_px: readings on the animal, pixels of the height map.
-        area_mm2: area seen from above, mm^2.
+        area_mm2: area from above, mm^2.
         volume_mm3: volume under the back, mm^3.
         x: centroid, mm, view frame.
         y: centroid, mm, view frame.
@@ -493,7 +493,7 @@ def blob_moments(heights, origin, step, plane, intrinsics, rotation, distance, m
         intrinsics: (4,) fx, fy, cx, cy px.
         rotation: (3, 3) of T_view_camera, whose translation is (0, 0, distance).
         distance: of the camera from the plane, mm.
-        moments: (N_MOMENTS,), out: pixels, area mm^2 (seen from the camera), volume mm^3, x, y mm
+        moments: (N_MOMENTS,), out: pixels, area mm^2 (from the camera), volume mm^3, x, y mm
             of the centroid, angle rad of the long axis (mod pi), the standard deviations mm along
             and across it, and 0, reserved for `back_slope`. All 0 for an empty map.
     """

@@ -67,7 +67,7 @@ def blob_areas(depths, limit, on_floor, bridge, mm2_per_px, areas, start, stop):
 
 @inner_kernel()
 def blob_area(blob, mm2_per_px):
-    """Area mm^2, seen from the camera, of a component at its mean depth.
+    """Area mm^2, from the camera, of a component at its mean depth.
 
     Args:
         blob: the component's counts.

@@ -103,10 +103,10 @@ def transition_cost(joints_a, joints_b, error_a, error_b, dt, costs):
         for k in range(3):
             off += (joints_b[j, k] - joints_a[j, k] - middle[k]) ** 2
         bend += np.sqrt(off) / n
-    seen = costs.error_factor**2 * (error_a * error_a + error_b * error_b)
-    cost = 0.5 * shift / (seen + (costs.shift * costs.length * dt) ** 2)
+    variance = costs.error_factor**2 * (error_a * error_a + error_b * error_b)
+    cost = 0.5 * shift / (variance + (costs.shift * costs.length * dt) ** 2)
     most = max(costs.ceiling, min(cost, costs.elsewhere))
-    cost += 0.5 * bend * bend / (seen + (costs.bend * costs.length * dt) ** 2)
+    cost += 0.5 * bend * bend / (variance + (costs.bend * costs.length * dt) ** 2)
     return min(costs.tail * np.log1p(cost / costs.tail), most)
 
 
@@ -146,7 +146,7 @@ def _keep_best(t, chains, n_beam, missed_cost):
 
 
 @kernel()
-def extend_all(start, stop, chains, n_beam, seen, costs):
+def extend_all(start, stop, chains, n_beam, frames, costs):
     """Viterbi over frames start to stop: add each with its hypotheses to the beam.
 
     A chain may begin at any frame and skips a frame at its missed-detection cost.
@@ -156,7 +156,7 @@ def extend_all(start, stop, chains, n_beam, seen, costs):
         stop: frame after the last.
         chains: `Chains`, updated in place.
         n_beam: number of beam rows in use.
-        seen: `Hypotheses`.
+        frames: `Hypotheses`.
         costs: `TransitionCosts`.
 
     Returns:
@@ -164,13 +164,13 @@ def extend_all(start, stop, chains, n_beam, seen, costs):
     """
     cost = chains.cost
     parent = chains.parent
-    missed_cost = seen.missed_cost
+    missed_cost = frames.missed_cost
     for t in range(start, stop):
-        for h in range(seen.joints.shape[1]):
+        for h in range(frames.joints.shape[1]):
             cost[t, h] = np.inf
             parent[t, h, 0] = NONE
             parent[t, h, 1] = NONE
-            if not np.isfinite(seen.emission[t, h]):
+            if not np.isfinite(frames.emission[t, h]):
                 continue
             best = missed_cost[t]  # the chain begins here
             for k in range(n_beam):
@@ -179,18 +179,18 @@ def extend_all(start, stop, chains, n_beam, seen, costs):
                 if so_far >= best and parent[t, h, 0] != NONE:
                     continue
                 transition = transition_cost(
-                    seen.joints[a, g],
-                    seen.joints[t, h],
-                    seen.error[a, g],
-                    seen.error[t, h],
-                    seen.times[t] - seen.times[a],
+                    frames.joints[a, g],
+                    frames.joints[t, h],
+                    frames.error[a, g],
+                    frames.error[t, h],
+                    frames.times[t] - frames.times[a],
                     costs,
                 )
                 if so_far + transition < best:
                     best = so_far + transition
                     parent[t, h, 0] = a
                     parent[t, h, 1] = g
-            cost[t, h] = best + seen.emission[t, h]
+            cost[t, h] = best + frames.emission[t, h]
         n_beam = _keep_best(t, chains, n_beam, missed_cost)
     return n_beam
 

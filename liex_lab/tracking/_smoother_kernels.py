@@ -77,11 +77,11 @@ def middles(joints, known, tip, middle, frame):
 
 
 @kernel()
-def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
+def weigh(measured, made, error, known, degrees_of_freedom, gate, weight, used):
     """Fill measurement weights from their distances to the curve; returns how many are used.
 
     Args:
-        seen: (n, J, 3) measured joints, mm.
+        measured: (n, J, 3) measured joints, mm.
         made: (n, J, 3) joints of the curve, mm.
         error: (n,) predicted mean joint error, mm.
         known: (n,) bool, measured.
@@ -90,7 +90,7 @@ def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
         weight: (n,) output at measured frames.
         used: (n,) bool output at measured frames, frames within the gate.
     """
-    n_joints = seen.shape[1]
+    n_joints = measured.shape[1]
     n_used = 0
     for t in range(known.size):
         if known[t]:
@@ -98,7 +98,7 @@ def weigh(seen, made, error, known, degrees_of_freedom, gate, weight, used):
             for j in range(n_joints):
                 apart = 0.0
                 for k in range(3):
-                    apart += (seen[t, j, k] - made[t, j, k]) ** 2
+                    apart += (measured[t, j, k] - made[t, j, k]) ** 2
                 off += np.sqrt(apart) / n_joints
             off /= error[t]
             weight[t] = (degrees_of_freedom + 1.0) / (degrees_of_freedom + off * off)
