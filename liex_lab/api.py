@@ -3,8 +3,6 @@
 `run_session` is `liex run`, `run_demo` is `liex demo`, and so on. Jobs are imported on first use.
 """
 
-# ruff: noqa: F401 - imported for the types of what `__getattr__` imports
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -22,31 +20,13 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.correct import correct_session, describe_session
     from liex_lab.pipelines.drawing import draw_figures, export_video
     from liex_lab.pipelines.evaluation.actions import evaluate_actions
-    from liex_lab.pipelines.evaluation.motion import evaluate_motion
-    from liex_lab.pipelines.evaluation.nyu import evaluate_nyu
     from liex_lab.pipelines.evaluation.paper.run import run_tables
-    from liex_lab.pipelines.evaluation.pose import (
-        evaluate_builds,
-        evaluate_pose,
-        evaluate_reference,
-        evaluate_sizes,
-    )
-    from liex_lab.pipelines.evaluation.scale import evaluate_report, run_scale, write_long
+    from liex_lab.pipelines.evaluation.scale import run_scale, write_long
     from liex_lab.pipelines.evaluation.scenes import evaluate_scenes
-    from liex_lab.pipelines.evaluation.speed import (
-        evaluate_live,
-        evaluate_recordings,
-        evaluate_speed,
-    )
-    from liex_lab.pipelines.evaluation.statistics import evaluate_statistics
-    from liex_lab.pipelines.evaluation.tracking import evaluate_tracking, search_noise
+    from liex_lab.pipelines.evaluation.tracking import evaluate_tracking
     from liex_lab.pipelines.live import follow_live
     from liex_lab.pipelines.session import run_demo, run_session
     from liex_lab.pipelines.study.status import SessionStatus
-    from liex_lab.pipelines.training.action_model import train_actions
-    from liex_lab.pipelines.training.motion_model import train_tracking
-    from liex_lab.pipelines.training.pose_model import train_model
-    from liex_lab.pipelines.training.shape_model import train_shape
     from liex_lab.pipelines.verify import verify_session
 
 _JOBS = {  # function: the module of `pipelines` that defines it

@@ -33,30 +33,31 @@ def test_a_model_of_ones_own_needs_no_card(models: Path) -> None:
     assert catalog.find_model(own, Path("elsewhere")) == own
 
 
-def test_a_changed_model_is_refused(models: Path) -> None:
-    (models / "mouse.npz").write_bytes(b"other bytes")
-    with pytest.raises(ModelError, match="damaged or was changed"):
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("mouse.npz", b"other bytes", "damaged or was changed"),
+        *(("mouse.json", card, "model card") for card in (b"{", b"[]", b"{}", b'{"sha256": 3}')),
+        ("mouse.json", None, "needs its card"),
+    ],
+)
+def test_a_damaged_model_or_card_is_refused_in_a_sentence(
+    models: Path, file: str, content: bytes | None, message: str
+) -> None:
+    if content is None:
+        (models / file).unlink()
+    else:
+        (models / file).write_bytes(content)
+    with pytest.raises(ModelError, match=message):
         catalog.find_model("mouse", models)
 
 
-@pytest.mark.parametrize("card", ["{", "[]", "{}", '{"sha256": 3}'])
-def test_a_bad_card_is_told_in_a_sentence(models: Path, card: str) -> None:
-    (models / "mouse.json").write_text(card)
-    with pytest.raises(ModelError, match="model card"):
-        catalog.find_model("mouse", models)
-
-
-def test_a_bundled_model_without_its_card_is_refused(models: Path) -> None:
-    (models / "mouse.json").unlink()
-    with pytest.raises(ModelError, match="needs its card"):
-        catalog.find_model("mouse", models)
-
-
-def test_a_wrong_name_says_which_there_are(models: Path) -> None:
-    with pytest.raises(ModelError, match="did you mean 'mouse'"):
-        catalog.find_model("mose", models)
-    with pytest.raises(ModelError, match="bundled are: mouse"):
-        catalog.find_model("x.npz", models)
+@pytest.mark.parametrize(
+    ("name", "hint"), [("mose", "did you mean 'mouse'"), ("x.npz", "bundled are: mouse")]
+)
+def test_a_wrong_name_says_which_there_are(models: Path, name: str, hint: str) -> None:
+    with pytest.raises(ModelError, match=hint):
+        catalog.find_model(name, models)
 
 
 def test_every_bundled_model_is_what_its_card_says() -> None:

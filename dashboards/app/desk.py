@@ -277,8 +277,13 @@ def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretc
     for one, other in combinations(animals, 2):
         if len(one.xy_mm) and len(one.xy_mm) == len(other.xy_mm):
             away_mm = np.linalg.norm(one.xy_mm - other.xy_mm, axis=1)
-            names = f"{one.individual} and {other.individual}"
-            found += _meetings(one, away_mm, spine_mm, names, "perhaps exchanged")
+            found += _meetings(
+                one,
+                away_mm,
+                spine_mm,
+                f"{one.individual} and {other.individual}",
+                "perhaps exchanged",
+            )
     if len(animals) == 1 and (session.metadata.get("verdict") or {}).get("n_animals", 1) > 1:
         centres = read_centres(session)
         if centres is not None:

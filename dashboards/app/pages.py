@@ -118,8 +118,7 @@ class Pages:
 
     def requested_table(self) -> Markup:
         """The table ?name=, filtered and sorted."""
-        asked = {key: request.args.get(key, "") for key in ("name", "words", "column")}
-        name, words, column = asked.values()
+        name, words, column = (request.args.get(key, "") for key in ("name", "words", "column"))
         return self.table(name, words=words, sorted_by=column, down=request.args.get("down") == "1")
 
     def sessions(self) -> str:

@@ -243,8 +243,13 @@ def make_app(
     of_recordings = regions is not None and regions.of_recordings
     shown = pages.Pages(data, desks, show_replay, saver is not None, of_recordings)
     pages.add_handlers(app, shown)
-    scenes = Scenes(data, images, regions)
-    views = _views(shown, corrections.Clerk(desks, saver), desks, scenes, Downloads(data))
+    views = _views(
+        shown,
+        corrections.Clerk(desks, saver),
+        desks,
+        Scenes(data, images, regions),
+        Downloads(data),
+    )
     if reviews is not None:
         views |= _review_views(corrections.Reviews(data, desks, reviews))
     for rule, view in views.items():
@@ -434,8 +439,11 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
     @server.errorhandler(413)
     def too_large(_: HTTPException) -> Response:
         """The request is larger than any request of the dashboard's pages."""
-        reason = f"The dashboard takes at most {MOST_BYTES >> 20} MB at a time."
-        return Response(reason, 413, mimetype="text/plain")
+        return Response(
+            f"The dashboard takes at most {MOST_BYTES >> 20} MB at a time.",
+            413,
+            mimetype="text/plain",
+        )
 
     @server.errorhandler(Exception)
     def fault(error: Exception) -> Any:

@@ -166,8 +166,9 @@ def joints_in_image(animals: Sequence[SessionAnimal], n: int) -> list[Array]:
     Returns:
         For each animal (n, J, 2) px; NaN without a pose.
     """
-    names = ["u_px", "v_px", *([] if animals[0].alone else ["individual"])]
-    table = animals[0].session.table("poses", names)
+    table = animals[0].session.table(
+        "poses", ["u_px", "v_px", *([] if animals[0].alone else ["individual"])]
+    )
     return [
         animal.rows_of(table)[["u_px", "v_px"]].to_numpy(float).reshape(n, -1, 2)
         for animal in animals

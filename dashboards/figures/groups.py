@@ -114,8 +114,7 @@ def occupancy_by_subject(animals: Sequence[SessionAnimal]) -> Figure | None:
         for subject, (session, found) in subjects.items():
             text = f"{subject} ({group}), {found.observed_s:.1f} s\nn = {counted(found.n, 'frame')}"
             panels.append((text, session, found))
-    title = f"Occupancy by subject, n = {counted(len(panels), 'subject')}"
-    return occupancy_panels(title, panels)
+    return occupancy_panels(f"Occupancy by subject, n = {counted(len(panels), 'subject')}", panels)
 
 
 def occupancy_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
@@ -128,8 +127,7 @@ def occupancy_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
             counts = f"n = {counted(len(own), 'subject')}\nmean of {mean.observed_s:.1f} s each"
             session = next(iter(subjects.values()))[0]
             panels.append((f"{group}, {counts}", session, mean))
-    title = f"Occupancy by group, n = {counted(len(panels), 'group')}"
-    return occupancy_panels(title, panels)
+    return occupancy_panels(f"Occupancy by group, n = {counted(len(panels), 'group')}", panels)
 
 
 def budgets_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
@@ -306,8 +304,9 @@ def _strip(
     means = animal_means(values, animal)
     beside = np.linspace(-0.2, 0.2, len(names_of)) if len(names_of) > 1 else np.zeros(1)
     colour, mark = group_colour(names[k], names), GROUP_MARKS[k % len(GROUP_MARKS)]
-    gid = f"animals {names[k]}"
-    large = axes.scatter(k + beside, means, 20.0, colour, marker=mark, gid=gid, zorder=3)
+    large = axes.scatter(
+        k + beside, means, 20.0, colour, marker=mark, gid=f"animals {names[k]}", zorder=3
+    )
     small = None
     if len(values) > len(names_of):  # else the sessions are the animals
         small = axes.scatter(
@@ -356,8 +355,10 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
         [f"{row['contrast']}\nn = {counted_units(row)}".replace(", ", ",\n") for row in rows],
         size=5.5,
     )
-    label = f"difference{f', {unit}' if unit else ''}, with its 95 % interval"
-    axes.set(ylim=(len(known) - 0.4, -0.6), xlabel=label)
+    axes.set(
+        ylim=(len(known) - 0.4, -0.6),
+        xlabel=f"difference{f', {unit}' if unit else ''}, with its 95 % interval",
+    )
 
 
 def _intervals(
@@ -368,8 +369,14 @@ def _intervals(
     for k, ((value, a, b), test) in enumerate(zip(spans, known["test"].astype(str), strict=True)):
         if np.isfinite([a, b]).all():
             axes.plot([a, b], [k, k], color=INK, linewidth=1.0, gid=f"interval {k}")
-        fill = INK if test and test != "nan" else "none"
-        axes.plot(value, k, "o", color=INK, markerfacecolor=fill, markersize=4.0)
+        axes.plot(
+            value,
+            k,
+            "o",
+            color=INK,
+            markerfacecolor=INK if test and test != "nan" else "none",
+            markersize=4.0,
+        )
     axes.axvline(0.0, color=MUTED, linewidth=0.6, linestyle=(0, (3, 2)))
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)
@@ -396,8 +403,11 @@ def _occupancies(
 
 def _added(some: Sequence[Occupancy]) -> Occupancy:
     """The sum of occupancies on one grid."""
-    total = np.sum([found.time_s for found in some], axis=0)
-    return replace(some[0], time_s=total, n=sum(found.n for found in some))
+    return replace(
+        some[0],
+        time_s=np.sum([found.time_s for found in some], axis=0),
+        n=sum(found.n for found in some),
+    )
 
 
 def _budget(sessions: Sequence[SessionAnimal], words: Sequence[str]) -> pd.Series[float]:

@@ -87,8 +87,7 @@ def draw_outlines(axes: Axes, session: Session, named: bool = True, centred: boo
         if not len(corners):
             continue
         corners = aligned(session, corners) if centred else corners
-        gid = f"zone {name}" if k else name
-        _outline(axes, corners, gid, dashed)
+        _outline(axes, corners, f"zone {name}" if k else name, dashed)
         if k and named:
             place = corners[:, 0].mean(), corners[:, 1].max()
             halo(axes.text(*place, name, ha="center", va="top", size=6.0))
@@ -143,8 +142,11 @@ def draw_hidden(axes: Axes, session: Session) -> None:
     """
     for x, y, start, stop in hidden_places(session):
         axes.plot(x, y, "x", color=INK, markersize=4, gid="hidden")
-        text = f"hidden {stop - start:.1f} s"
-        halo(axes.annotate(text, (x, y), (3, 2), textcoords="offset points", size=6.0))
+        halo(
+            axes.annotate(
+                f"hidden {stop - start:.1f} s", (x, y), (3, 2), textcoords="offset points", size=6.0
+            )
+        )
 
 
 def draw_occupancy(axes: Axes, found: Occupancy, most: float) -> Any:

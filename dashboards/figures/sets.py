@@ -297,8 +297,11 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
                 continue
             for kind in FORMATS:
                 if kind == "svg" or kind in asked or f"{name}.{kind}" in there:
-                    image = svg if kind == "svg" else image_bytes(figure, kind)
-                    put_figure(folder, f"{name}.{kind}", image)
+                    put_figure(
+                        folder,
+                        f"{name}.{kind}",
+                        svg if kind == "svg" else image_bytes(figure, kind),
+                    )
             if pages is not None:
                 pages.savefig(figure)
     if folder is not None and made:

@@ -268,8 +268,9 @@ def image_bytes(figure: Figure, kind: str) -> bytes:
     """
     held = io.BytesIO()
     undated: Any = {{"svg": "Date", "pdf": "CreationDate", "png": "Software"}[kind]: None}
-    paper = "white" if kind == "png" else "none"
-    figure.savefig(held, format=kind, metadata=undated, facecolor=paper)
+    figure.savefig(
+        held, format=kind, metadata=undated, facecolor="white" if kind == "png" else "none"
+    )
     made = held.getvalue()
     # this font comes with matplotlib: the same figure on every machine
     return made.replace(b"'DejaVu Sans'", _FACES.encode()) if kind == "svg" else made

@@ -146,8 +146,9 @@ def curves(
         axes.plot(
             time_s[near][kept] / size, values[near][kept], color=colour, marker=marker, markersize=1
         )
-        low = float(np.nanmin(values, initial=0.0)) if from_zero else None
-        axes.set(ylabel=unit, ylim=(low, None))
+        axes.set(
+            ylabel=unit, ylim=(float(np.nanmin(values, initial=0.0)) if from_zero else None, None)
+        )
         axes.grid(axis="y", color=LINE, linewidth=0.4)
         _clock(axes, (first_s, last_s), last=k == len(rows) - 1)
     return figure

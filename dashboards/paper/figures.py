@@ -177,8 +177,13 @@ def _by_split(
         for panel, split in zip(line, one["splits"], strict=False):
             panel.set_title(f"{one['animal']}, {split}")
             panel.grid(alpha=0.3)
-            rows = {METHODS[name]: row["splits"][split] for name, row in one["rows"].items()}
-            panels.append((panel, one, rows))
+            panels.append(
+                (
+                    panel,
+                    one,
+                    {METHODS[name]: row["splits"][split] for name, row in one["rows"].items()},
+                )
+            )
     return figure, panels
 
 
@@ -305,8 +310,7 @@ def draw_candidates(shown: Mapping[str, Any], path: Path) -> Path:
         _height_map(panel, shown, ranked["joints_px"][k])
         above = f"{k + 1}: {ranked['score_mm'][k]:.2f} mm"
         panel.set_title(above, color="#117733", fontsize=8)
-        below = f"{true_rank[k]}: {ranked['error_mm'][k]:.2f} mm"
-        panel.set_xlabel(below, color=_POSE, fontsize=8)
+        panel.set_xlabel(f"{true_rank[k]}: {ranked['error_mm'][k]:.2f} mm", color=_POSE, fontsize=8)
     figure.suptitle(
         f"{shown['animal']}: candidates of one image, red; truth, blue. Above: rank and predicted "
         "error; below: true rank and error.\nRank correlation of the two, mean of "

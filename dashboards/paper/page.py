@@ -232,8 +232,9 @@ def _origin(row: Mapping[str, Any] | None) -> str:
 
 def _median(numbers: Mapping[str, Any]) -> str:
     bounds = numbers.get("interval95")
-    interval = f" ({_number(bounds[0])} to {_number(bounds[1])})" if bounds else ""
-    return _number(numbers["median_mm"]) + interval
+    return _number(numbers["median_mm"]) + (
+        f" ({_number(bounds[0])} to {_number(bounds[1])})" if bounds else ""
+    )
 
 
 def rate_table(results: Sequence[Results]) -> Table:

@@ -259,8 +259,15 @@ def suggest(
     for one in suggestions:
         clip = found_video(opened, stretch(one.start_s, one.stop_s))
         span = (f"{one.start_s:.2f}", f"{one.stop_s:.2f}")
-        name = "" if clip is None else clip.name
-        rows.append((*span, one.guess, one.or_else, f"{one.uncertainty:.2f}", name))
+        rows.append(
+            (
+                *span,
+                one.guess,
+                one.or_else,
+                f"{one.uncertainty:.2f}",
+                "" if clip is None else clip.name,
+            )
+        )
     print_table(rows, "from (s)", "to (s)", "taken for", "or else", "doubt", "clip")
 
 

@@ -262,8 +262,12 @@ def show(
             "screen, or add --web"
         )
     with tempfile.TemporaryDirectory(prefix="liex-show-") as scratch:
-        more = [] if depth == "kept" else _whole_depth(session, Path(scratch), recording)
-        _show(replay, more, at_s, web)
+        _show(
+            replay,
+            [] if depth == "kept" else _whole_depth(session, Path(scratch), recording),
+            at_s,
+            web,
+        )
 
 
 def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Path]:
@@ -298,8 +302,9 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
         source = quote(f"rerun+http://{_HERE}:{data}/proxy", safe="")
         say(f"replay: http://{_HERE}:{page}?url={source}   (Ctrl+C ends it)")
         hosted = ["--web-viewer", "--web-viewer-port", str(page), "--port", str(data)]
-    shown = [str(file) for file in replays_with(replay, more)]
-    command = own_python("-m", "rerun", *shown, "--bind", _HERE, *hosted)
+    command = own_python(
+        "-m", "rerun", *[str(file) for file in replays_with(replay, more)], "--bind", _HERE, *hosted
+    )
     quiet = {"RUST_LOG": "warn"} if web else {}  # its log would hide the address
     around = {**quiet, **os.environ, "RERUN_ANALYTICS": "0"}
     raise typer.Exit(subprocess.run(command, env=around, check=False).returncode)

@@ -181,8 +181,9 @@ def nearest(real: PointMotion, virtual: PointMotion) -> Array:
     own, drawn = (  # the five angles (n, 5) of each posture
         np.stack([*one.posture().values()][:-1], axis=-1) for one in (real, virtual)
     )
-    mirror = np.array([-1.0 if name in _UNSIGNED else 1.0 for name in POSTURE[:-1]])
-    drawn = np.concatenate([drawn, drawn * mirror])
+    drawn = np.concatenate(
+        [drawn, drawn * np.array([-1.0 if name in _UNSIGNED else 1.0 for name in POSTURE[:-1]])]
+    )
     return np.concatenate(
         [
             np.sqrt(((own[at : at + _AT_ONCE, None] - drawn) ** 2).mean(axis=-1).min(axis=1))

@@ -362,8 +362,11 @@ def search_noise(
         followed: Callable[[simulator.TestSequence, Segmenter, float], Followed],
     ) -> float:
         """Mean error over the frames in view of all sequences."""
-        errors = [followed(*s).in_view(s[0].events, s[0].spine_mm) for s in sequences]
-        return float(np.concatenate(errors).mean())
+        return float(
+            np.concatenate(
+                [followed(*s).in_view(s[0].events, s[0].spine_mm) for s in sequences]
+            ).mean()
+        )
 
     alone = mean_mm(lambda recording, scene, size: _single(recording, estimator, scene, size))
     found = {}

@@ -312,8 +312,9 @@ def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
 def _generator(animal: str) -> bytes:
     """SHA-256 of the code that generates and renders the behaviour."""
     folder = Path(agents.__file__).parent
-    content = b"".join((folder / name).read_bytes() for name in ("agent.py", f"{animal}.py"))
-    return hashlib.sha256(content).digest()
+    return hashlib.sha256(
+        b"".join((folder / name).read_bytes() for name in ("agent.py", f"{animal}.py"))
+    ).digest()
 
 
 def _save(path: Path, group: list[AgentTrack]) -> None:

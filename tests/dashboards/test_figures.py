@@ -18,9 +18,7 @@ from liex_lab.dashboards.figures.style import (
     joined,
     on_page,
 )
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
-from matplotlib.text import Text
 
 from liex_lab.actions.vocabulary import action_colours
 from liex_lab.api import compare_groups, draw_figures
@@ -240,27 +238,6 @@ def test_a_plan_asks_for_the_formats_beside_every_report(session, own, tmp_path,
     own.metadata["plan"]["report"] = {"figures": ["svg", "png"]}
     sets.for_the_page(own, tmp_path)
     assert {path.name for path in tmp_path.glob("speed*")} == {"speed.svg", "speed.png"}
-
-
-@pytest.mark.nightly
-def test_every_name_of_the_transitions_is_on_the_paper():
-    words = ["rear_unsupported", "stretch_attend", "turn_right", "rear_supported", "walk", "run"]
-    n = len(words)
-    pairs = [(one, other) for one in words for other in words if one != other]
-    table = pd.DataFrame(pairs, columns=["from_action", "to_action"]).assign(
-        n=2, n_from=2 * (n - 1), probability=1 / (n - 1), by_chance=1 / (n - 1), p_fdr=1.0
-    )
-    for first in range(n):  # each of them stands once at each place of the circle
-        own = words[first:] + words[:first]
-        one: Any = SimpleNamespace(label="m01", words=own, table=lambda name: table)
-        with drawing():
-            figure = times.transitions(one)
-            assert figure is not None
-            FigureCanvasAgg(figure).draw()
-        for text in figure.findobj(Text):
-            box = text.get_window_extent()
-            assert box.x0 >= 0, text.get_text()
-            assert box.x1 <= figure.bbox.width, text.get_text()
 
 
 def test_every_figure_has_something_to_show_of_a_usual_session(session, tmp_path):

@@ -52,9 +52,6 @@ def test_a_region_is_drawn_by_clicks_and_keys_over_the_scene_and_saved_as_a_run_
     scene = page.locator("img.scene")
     scene.scroll_into_view_if_needed()
     expect(scene).to_have_js_property("naturalWidth", SMALL.width)
-    drawn_scene = page.request.get(f"{served.address}/region/{KEY}/scene.svg").text()
-    assert "62 mm" in drawn_scene
-    assert 'class="outline"' in drawn_scene
     page.get_by_role("link", name="Draw the region of the arena").click()
     page.wait_for_selector("#region.is-open .scene-line")
     page.locator(".region-stage").scroll_into_view_if_needed()

@@ -3,9 +3,7 @@ the agreement at the end.
 """
 
 import json
-from pathlib import Path
 
-import pytest
 from playwright.sync_api import Page, expect
 
 from tests.dashboards.conftest import Watched
@@ -81,20 +79,3 @@ def test_clips_are_named_blindly_by_two_and_agree_as_they_should(
 def _of_clips(address: str) -> bool:
     """Whether an answer is about a clip, in words: it may not tell whose."""
     return "/clip/" in address and not address.split("?")[0].endswith((".png", "/times"))
-
-
-@pytest.mark.nightly
-def test_what_cannot_be_reviewed_is_a_sentence(served: Served, watched: Watched) -> None:
-    page = watched.page
-    page.goto(f"{served.address}/review")
-    page.locator("#review-rater").fill("Cid")
-    page.locator("#review-name").fill("too long")
-    page.locator("#review-n").fill("400")
-    page.get_by_role("button", name="Begin, or go on").click()
-    expect(page.locator("#review [role=alert]")).to_contain_text("400 clips were asked for")
-    sent = page.request.post(
-        f"{served.address}/reviews/nothing/answer", data={"rater": "a", "clip": 0, "word": ""}
-    )
-    assert sent.status == 400
-    assert "there is no review 'nothing'" in sent.json()["said"]
-    assert not list(Path(served.study.parent / "reviews").glob("too long*"))

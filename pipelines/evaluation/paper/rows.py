@@ -72,8 +72,9 @@ def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subj
     if variant not in TRAINING_DRAWS:
         return [subject_of(animal, variant, progress)]
     draws = range(TRAINING_DRAWS[variant])
-    models = [estimator_of(animal, "paper", progress, draw=draw) for draw in draws]
-    return runs_of_models(variant, models)
+    return runs_of_models(
+        variant, [estimator_of(animal, "paper", progress, draw=draw) for draw in draws]
+    )
 
 
 def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subject]:

@@ -391,14 +391,16 @@ def _sensitivities(
     curves = {}
     for variant in SWEPT[: 1 if budget.quick else None]:
         if budget.curves:
-            sweep = QUICK_SWEEP if budget.quick else Sweep()
-            curve = rows.sensitivity(skeleton, variant, sweep, progress)
+            curve = rows.sensitivity(
+                skeleton, variant, QUICK_SWEEP if budget.quick else Sweep(), progress
+            )
             curves[variant] = {**curve, "made": _made_by(command), "origin": "measured"}
         elif variant in kept:
             curves[variant] = {**kept[variant], "origin": "kept"}
         else:
-            why = f"no curve is kept; {_command_for(skeleton.name, CURVES)} measures it"
-            missing[f"Fig. 7, {variant}"] = why
+            missing[f"Fig. 7, {variant}"] = (
+                f"no curve is kept; {_command_for(skeleton.name, CURVES)} measures it"
+            )
     return curves
 
 
@@ -464,8 +466,9 @@ def measure_further(
         further["actions"] = _actions("fish", 12 if quick else 1, progress)
         further["key_frames"] = rows.acted_key_frames("fish")
     if nyu is None:
-        why = f"no folder was named with --nyu; with the data `{_VERBS['nyu']}` makes it"
-        further["missing"]["nyu"] = why
+        further["missing"]["nyu"] = (
+            f"no folder was named with --nyu; with the data `{_VERBS['nyu']}` makes it"
+        )
     else:
         further["figures"].append(folder / "fig12_nyu_hands.png")
         further["nyu"] = evaluate_nyu(nyu, figure=further["figures"][-1], progress=progress)
