@@ -63,6 +63,14 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "train_model": "training.pose_model",
     "train_shape": "training.shape_model",
     "train_tracking": "training.motion_model",
+    "convert": "convert",
+    "pack": "convert",
+    "examine": "doctor",
+    "print_report": "doctor",
+    "whole_images": "drawing",
+    "begin_study": "study.init",
+    "read_any_labels": "training.action_model",
+    "suggest": "training.action_model",
 }
 
 __all__ = [  # noqa: RUF022 - in the order of the manual

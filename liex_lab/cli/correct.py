@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import liex_lab
 from liex_lab import api
 from liex_lab.cli.options import SessionPath, group_of_verbs, print_table, say
 from liex_lab.errors import SessionError
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
-    from liex_lab.sessions import Session
     from liex_lab.sessions.corrections import Correction
 
 correct = group_of_verbs("Correct a session; corrections are kept in its folder and can be undone.")
@@ -105,10 +105,9 @@ def bout(
     new = ["new"] if new_word else []
     match (at_s, action, start_s, stop_s, delete, labels):
         case (None, None, None, None, False, Path()):
-            from liex_lab.pipelines.training.action_model import read_any_labels
             from liex_lab.sessions.correcting import labelled_bouts
 
-            _do(session, labelled_bouts(_opened(session), read_any_labels(labels)), by)
+            _do(session, labelled_bouts(_opened(session), api.read_any_labels(labels)), by)
         case (None, str(), float(), float(), False, None):
             _say(session, ["add", action, start_s, stop_s, *new], by)
         case (float(), str(), None, None, False, None):
@@ -127,10 +126,9 @@ def bout(
 @correct.command("list")
 def list_corrections(session: SessionPath) -> None:
     """List all corrections with author, time and state."""
-    from liex_lab.sessions import Session
     from liex_lab.sessions.corrections import FOLDER, applies, read_log
 
-    opened = Session.open(session, raw=True)
+    opened = liex_lab.Session.open(session, raw=True)
     log = read_log(opened.path)
     if not log.entries:
         say(f"{opened.path} has no corrections")
@@ -215,10 +213,8 @@ def describe(
     say(f"report:    {session / 'report.html'}")
 
 
-def _opened(session: Path) -> Session:
-    from liex_lab.sessions import Session
-
-    return Session.open(session)
+def _opened(session: Path) -> liex_lab.Session:
+    return liex_lab.Session.open(session)
 
 
 def _say(session: Path, sentence: Sequence[object], by: str) -> None:

@@ -71,14 +71,21 @@ app = group_of_verbs(
 )
 app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
 app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
-app.command(rich_help_panel=SESSIONS)(describe)
-app.command(rich_help_panel=SESSIONS)(report)
-app.command(rich_help_panel=SESSIONS)(figures)
-app.command(rich_help_panel=SESSIONS)(verify)
-app.command(rich_help_panel=SESSIONS)(export)
-app.command(rich_help_panel=STUDIES)(cohort)
-app.command(rich_help_panel=STUDIES)(compare)
-app.command(rich_help_panel=STUDIES)(dashboard)
+for command, section in (
+    (describe, SESSIONS),
+    (report, SESSIONS),
+    (figures, SESSIONS),
+    (verify, SESSIONS),
+    (export, SESSIONS),
+    (cohort, STUDIES),
+    (compare, STUDIES),
+    (dashboard, STUDIES),
+    (convert, RECORDINGS),
+    (pack, RECORDINGS),
+    (train, MODELS),
+    (show, START),
+):
+    app.command(rich_help_panel=section)(command)
 
 
 def _version(wanted: bool) -> None:
@@ -208,10 +215,8 @@ def doctor(
     stated = [*asked, *([] if fps is None else [f"recording.fps={fps}"])]
     options = [] if topic is None else ["--topic", topic]
     options += [word for setting in stated for word in ("--set", setting)]
-    from liex_lab.pipelines.doctor import examine, print_report
-
     with progress_bar() as progress:
-        findings = examine(
+        findings = api.examine(
             recording,
             plan=chosen,
             fps=fps,
@@ -224,14 +229,7 @@ def doctor(
     if as_json:
         say(to_json(findings))
     else:
-        print_report(findings, verbose)
-
-
-app.command(rich_help_panel=RECORDINGS)(convert)
-app.command(rich_help_panel=RECORDINGS)(pack)
-
-
-app.command(rich_help_panel=MODELS)(train)
+        api.print_report(findings, verbose)
 
 
 @app.command(rich_help_panel=SESSIONS)
@@ -246,15 +244,13 @@ def suggest(
     ] = False,
 ) -> None:
     """List the parts of a session to label next: those the recogniser is least sure of."""
-    from liex_lab.pipelines.training.action_model import suggest as job
-    from liex_lab.sessions import Session
     from liex_lab.sessions.session import found_video, stretch
 
-    suggestions = list(job(session, model=model, n=n).itertuples())
+    suggestions = list(api.suggest(session, model=model, n=n).itertuples())
     if video:
         for one in suggestions:
             api.export_video(session, start_s=one.start_s, stop_s=one.stop_s, overwrite=True)
-    opened = Session.open(session)
+    opened = liex_lab.Session.open(session)
     rows = []
     for one in suggestions:
         clip = found_video(opened, stretch(one.start_s, one.stop_s))
@@ -311,9 +307,6 @@ def live(
         say(f"replay: {to}; Rerun's viewer opens it: rerun {to}")
 
 
-app.command(rich_help_panel=START)(show)
-
-
 @app.command(rich_help_panel=MODELS)
 def info(
     plan: Annotated[str | None, typer.Option("--plan", help="Print this plan as TOML.")] = None,
@@ -322,10 +315,10 @@ def info(
     ] = False,
 ) -> None:
     """Show versions, bundled plans and models; `liex info --plan mouse` prints a plan."""
-    from liex_lab.plan import Plan, known_plans
+    from liex_lab.plan import known_plans
 
     if plan is not None:
-        typer.echo(Plan.load(plan).to_toml(), nl=False)
+        typer.echo(liex_lab.Plan.load(plan).to_toml(), nl=False)
         return
     from liex_lab.catalog import bundled_models
     from liex_lab.sessions.provenance import versions

@@ -1,7 +1,7 @@
 """Commands that train and evaluate models: `liex train` and `liex evaluate`."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
@@ -89,49 +89,36 @@ def train(
     animal's tracks may be (tunings.toml), `liex train shape` how the build of an animal shows, and
     how its poses err with it.
     """
-    if animal == "actions":
-        _train_actions(of, out, sessions or (), labels or (), pose_model, json_file)
-        return
+    report: Result = {}
+    what = {"actions": "model", "tracking": "tunings", "shape": "shapes"}.get(animal, "model")
     with progress_bar() as progress:
-        if animal == "tracking" and particles:
-            found = api.search_noise(of, n_frames=n_frames, progress=progress)
+        how: Result = {"workers": workers, "progress": progress}
+        if animal == "actions":
+            made, report = api.train_actions(
+                out or Path(f"{of}-actions.skops"),
+                animal=of,
+                sessions=sessions or (),
+                labels=labels or (),
+                pose_model=pose_model,
+                progress=progress,
+            )
+        elif animal == "tracking" and particles:
+            report = api.search_noise(of, n_frames=n_frames, progress=progress)
         elif animal == "tracking":
-            tunings = out or Path("tunings.toml")
-            made = f"tunings: {api.train_tracking(of, tunings, workers=workers, progress=progress)}"
+            made = api.train_tracking(of, out or Path("tunings.toml"), **how)
         elif animal == "shape":
-            shapes = out or Path(f"{of}-shapes.npz")
-            made = f"shapes: {api.train_shape(of, shapes, workers=workers, progress=progress)}"
+            made = api.train_shape(of, out or Path(f"{of}-shapes.npz"), **how)
         else:
-            how: Result = {"workers": workers, "n_images": n_images, "progress": progress}
             file = out or Path(f"{Path(animal).stem}.npz")
-            made = f"model: {api.train_model(animal, variant, file, **how)}"
+            made = api.train_model(animal, variant, file, n_images=n_images, **how)
     if animal == "tracking" and particles:
-        tell_numbers(found, json_file or out)
-    else:
-        say(made)
-
-
-def _train_actions(
-    animal: str,
-    out: Path | None,
-    sessions: Sequence[Path],
-    labels: Sequence[Path],
-    pose_model: str | None,
-    json_file: Path | None,
-) -> None:
-    with progress_bar() as progress:
-        model, report = api.train_actions(
-            out or Path(f"{animal}-actions.skops"),
-            animal=animal,
-            sessions=sessions,
-            labels=labels,
-            pose_model=pose_model,
-            progress=progress,
-        )
-    if json_file is not None:
-        keep_numbers(report, json_file)
-    tell_scores(report)
-    say(f"model: {model}")
+        tell_numbers(report, json_file or out)
+        return
+    if animal == "actions":
+        if json_file is not None:
+            keep_numbers(report, json_file)
+        tell_scores(report)
+    say(f"{what}: {made}")
 
 
 # `liex evaluate`: reproduces every published number.
@@ -177,14 +164,15 @@ def benchmark(
 
 def show_poses(result: Result) -> None:
     """Print the numbers of a split; for other-build, a row for each kind of build."""
-    if "usual" not in result:
-        return tell_numbers(result)
-    tell_rows(
-        {
-            kind: {k: v for k, v in result[kind].items() if not isinstance(v, dict | list)}
-            for kind in ("other", "usual")
-        }
-    )
+    if "usual" in result:
+        tell_rows(
+            {
+                kind: {k: v for k, v in result[kind].items() if not isinstance(v, dict | list)}
+                for kind in ("other", "usual")
+            }
+        )
+    else:
+        tell_numbers(result)
 
 
 @benchmark("pose", show_poses)

@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from liex_lab.errors import printable
-
-if TYPE_CHECKING:
-    from liex_lab.plan import Plan
+import liex_lab
+from liex_lab.errors import PlanError, printable
 
 RecordingPath = Annotated[
     Path,
@@ -73,8 +71,6 @@ def region_setting(region: str | None) -> list[str]:
     Raises:
         PlanError: it is neither.
     """
-    from liex_lab.errors import PlanError
-
     if region is None:
         return []
     words = region.split()
@@ -99,11 +95,9 @@ def region_setting(region: str | None) -> list[str]:
     return [f'arena.region={{polygon = {corners}, unit = "mm"}}']
 
 
-def load_plan(plan: str | None, settings: Sequence[str]) -> Plan:
+def load_plan(plan: str | None, settings: Sequence[str]) -> liex_lab.Plan:
     """The named plan, or the usual one, with settings: an error in them is raised at once."""
-    from liex_lab.plan import Plan
-
-    return Plan.load(plan or "mouse").with_settings(settings)
+    return liex_lab.Plan.load(plan or "mouse").with_settings(settings)
 
 
 def say(text: object) -> None:

@@ -18,6 +18,7 @@ from urllib.parse import quote
 
 import typer
 
+import liex_lab
 from liex_lab import api
 from liex_lab.cli.options import (
     RecordingPath,
@@ -191,7 +192,6 @@ def export(
 ) -> None:
     """Export sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, CSV or Excel, or as a video."""
     from liex_lab.exchange import export as job
-    from liex_lab.sessions import Session
 
     if to == "video":
         with progress_bar() as progress:
@@ -213,7 +213,7 @@ def export(
             "actions, groups and times are chosen for `--to video`; the other formats hold all"
         )
     for place in places:
-        say(f"export: {job(Session.open(place), to, out, overwrite=overwrite)}")
+        say(f"export: {job(liex_lab.Session.open(place), to, out, overwrite=overwrite)}")
 
 
 # The command `liex show`: a session's replay in Rerun, optionally with full depth images.
@@ -248,14 +248,13 @@ def show(
     ] = None,
 ) -> None:
     """Open a session's replay in Rerun."""
-    from liex_lab.sessions import Session
     from liex_lab.sessions.viewer import has_screen
 
     if web and at_s is not None:
         raise typer.BadParameter("a moment can be shown in a window only; leave out --web or --at")
     if recording is not None and depth != "all":
         raise typer.BadParameter("a recording is read for full depth images only; add --depth all")
-    replay = Session.open(session).path / "session.rrd"
+    replay = liex_lab.Session.open(session).path / "session.rrd"
     if at_s is None and not web and not has_screen():
         raise LiexError(
             f"Rerun needs a screen and there is none here; open {replay} on a computer with a "
@@ -272,11 +271,9 @@ def show(
 
 def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Path]:
     """A replay of a session's full depth images; empty, with a note, if there is no recording."""
-    from liex_lab.pipelines.drawing import whole_images
-
     try:
         with progress_bar() as progress:
-            return [whole_images(session, scratch / "depth.rrd", recording, progress)]
+            return [api.whole_images(session, scratch / "depth.rrd", recording, progress)]
     except LiexError as error:
         say(f"note: {error}")
         say("note: the replay shows what the session keeps of the depth")
@@ -346,10 +343,8 @@ def convert(
     ] = False,
 ) -> None:
     """Convert a recording to MCAP (lossless) or to a folder of 16-bit PNG images."""
-    from liex_lab.pipelines.convert import convert as job
-
     with progress_bar() as progress:
-        done = job(
+        done = api.convert(
             recording,
             to,
             fps=fps,
@@ -402,14 +397,12 @@ def pack(
     ] = False,
 ) -> None:
     """Pack a recording into a lossless archive of half its size, which all commands read."""
-    from liex_lab.pipelines.convert import pack as job
-
     if whole and region is not None:
         raise typer.BadParameter("--whole keeps every pixel; leave out --region or --whole")
     asked = [*region_setting(region), *([] if topic is None else [f"recording.topic={topic}"])]
     chosen = load_plan(plan, [*asked, *(settings or [])])
     with progress_bar() as progress:
-        done = job(
+        done = api.pack(
             recording,
             to,
             plan=chosen,
@@ -476,10 +469,8 @@ def cohort(
 ) -> None:
     """Measure the pending sessions of a study; exits with code 3 if a session failed."""
     if study == "init":
-        from liex_lab.pipelines.study.init import begin_study
-
         with progress_bar() as progress:
-            file = begin_study(folder or Path(), overwrite, say=say, progress=progress)
+            file = api.begin_study(folder or Path(), overwrite, say=say, progress=progress)
         say(f"study: {file}")
         return
     if folder is not None:

@@ -261,12 +261,6 @@ class Built:
     found_mm: float
     tip: int
 
-    @property
-    def followed(self) -> Followed:
-        """Its errors, intervals and exchanged ends; the tracker's speed is NaN."""
-        track = self.track
-        return Followed(track.joints_mm, self.truth, track.sd_xyz_mm, np.nan, self.tip)
-
 
 def evaluate_builds(
     animal: str = "mouse",
@@ -367,7 +361,10 @@ def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any
     Returns:
         By name; without a pose, only those that need none.
     """
-    followed = [row.followed for row in rows]
+    followed = [
+        Followed(row.track.joints_mm, row.truth, row.track.sd_xyz_mm, np.nan, row.tip)
+        for row in rows
+    ]
     recording = np.repeat(np.arange(len(rows)), [len(row.truth) for row in rows])
     lengths_mm = np.array([row.length_mm for row in rows])[recording]
     error = np.concatenate([one.error_mm for one in followed]) / lengths_mm
