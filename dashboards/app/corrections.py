@@ -119,8 +119,10 @@ class Saver:
     def busy(self, folder: Path) -> tuple[int, bool]:
         """The number of unsaved corrections of a session, and whether its report is out of date."""
         with self._changed:
-            unsaved = sum(ticket.folder == folder for ticket in self._waiting)
-            return unsaved, folder in (*self._reports, self._reporting)
+            return sum(ticket.folder == folder for ticket in self._waiting), folder in (
+                *self._reports,
+                self._reporting,
+            )
 
     def finish(self) -> None:
         """Return when all corrections are saved and the reports are made."""
@@ -427,8 +429,14 @@ class Reviews:
                     raise SessionError(
                         "a review needs a number of clips and a seed, a whole number"
                     )
-                sessions = {entry.key: self._data.session(entry.key) for entry in self._data.done}
-                self._write(drawn_review(name, sessions, n, seed))
+                self._write(
+                    drawn_review(
+                        name,
+                        {entry.key: self._data.session(entry.key) for entry in self._data.done},
+                        n,
+                        seed,
+                    )
+                )
         return {"name": name}
 
     def state(self, name: str, rater: str | None = None) -> dict[str, Any]:

@@ -52,8 +52,11 @@ class Desk(Footage):
     def _numbers(self) -> dict[str, Any]:
         """Columns of `frames` that are sent for every frame."""
         names = ["flag", "predicted_error_mm", "p_flip", "frame_index"]
-        more = [] if self.animals[0].alone else ["individual"]
-        table = self.animals[0].rows_of(self.session.table("frames", [*names, *more]))
+        table = self.animals[0].rows_of(
+            self.session.table(
+                "frames", [*names, *([] if self.animals[0].alone else ["individual"])]
+            )
+        )
         return {name: table[name].to_numpy() for name in names}
 
     @cached_property
@@ -106,8 +109,11 @@ class Desk(Footage):
 
     def bouts(self) -> list[dict[str, Any]]:
         """Every bout: action, start_s, stop_s, source and score."""
-        names = ["action", "start_s", "stop_s", "source", "score"]
-        table = self.animals[0].bouts[names].astype({"action": str, "source": str})
+        table = (
+            self.animals[0]
+            .bouts[["action", "start_s", "stop_s", "source", "score"]]
+            .astype({"action": str, "source": str})
+        )
         score = table["score"].astype(float).round(3).astype(object)
         return records(table.assign(score=score.where(score.notna(), None)))
 

@@ -201,8 +201,14 @@ class Pages:
             )
             values = self.data.read(key, lambda session: facts(session, at_s))
             path = self.data.session(key).path
-            command = f"liex show {shlex.quote(str(path))} --at {at_s:.3f}"
-            return _timed("around", [figure], span, _AROUND_MM, facts=values, command=command)
+            return _timed(
+                "around",
+                [figure],
+                span,
+                _AROUND_MM,
+                facts=values,
+                command=f"liex show {shlex.quote(str(path))} --at {at_s:.3f}",
+            )
 
     def step(self, key: str) -> Response:
         """The time of the next or previous (?to=) frame, bout or flag (?by=) from ?t= (s)."""
@@ -260,8 +266,10 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
     group_of = {entry.key: entry.who.get("group", "") for entry in data.done}
     keys = [key for key in group_of if key in chosen]  # sessions take precedence over groups
     if not chosen:
-        within = [key for key, group in group_of.items() if not names or group in names]
-        keys = sorted(within, key=lambda key: group_of[key])
+        keys = sorted(
+            [key for key, group in group_of.items() if not names or group in names],
+            key=lambda key: group_of[key],
+        )
     ones = data.ethograms(keys)
     words = shown_words(ones.values())
     vocabulary = dict.fromkeys(word for one in ones.values() for word in one.vocabulary)
@@ -316,9 +324,13 @@ def _bars(
     for a, b in pairwise(edges):
         word = named[codes[a]] if b > a else ""
         at = (start_s + a * (stop_s - start_s) / n) / unit[1]
-        label = f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}"
         bars.append(
-            {"at": 100.0 * a / n, "width": 100.0 * (b - a) / n, "word": word, "said": label}
+            {
+                "at": 100.0 * a / n,
+                "width": 100.0 * (b - a) / n,
+                "word": word,
+                "said": (f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}"),
+            }
         )
     return bars
 
@@ -406,10 +418,9 @@ def _verdict(row: dict[str, Any], unit: str) -> dict[str, Any]:
         f"sessions, {row['n_bouts']:,} bouts, {number(row['observed_min'])} min; "
         f"{row['n_without_value']} sessions without a value."
     )
-    result = cohort.result(row, unit)
     return {
         "contrast": row["contrast"],
-        "result": result,
+        "result": cohort.result(row, unit),
         "counts": counts,
         "tested": bool(row["test"]),
     }

@@ -453,8 +453,11 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
         cause = printable(f"{type(error).__name__}: {error}")[:300]
         where = printable(request.path)[:200]
         print(f"dashboard: {where} could not be answered ({cause})", file=sys.stderr)
-        reason = "This request cannot be answered; load the page again. The terminal says why."
-        return Response(reason, 500, mimetype="text/plain")
+        return Response(
+            "This request cannot be answered; load the page again. The terminal says why.",
+            500,
+            mimetype="text/plain",
+        )
 
 
 def _site(address: str, name: bool = False) -> str | None:

@@ -137,8 +137,12 @@ def find(data: StudyData, name: str) -> Table:
         return Table(data.stats(measure, reference or None), STATS, units=data.units())
     if what in _OF_SESSION and rest:
         rows = data.read(rest, lambda session: session.table(what))
-        shown = {column: title for column, title in _OF_SESSION[what].items() if column in rows}
-        return Table(rows, shown, "start_s", BOUT_UNITS)
+        return Table(
+            rows,
+            {column: title for column, title in _OF_SESSION[what].items() if column in rows},
+            "start_s",
+            BOUT_UNITS,
+        )
     raise SessionError(f"there is no table '{name}'")
 
 
@@ -224,8 +228,10 @@ def session_table(data: StudyData, key: str, name: str) -> pd.DataFrame:
 def session_tables(data: StudyData, key: str) -> list[str]:
     """Names of a session's tables."""
     session = data.session(key)
-    names = sorted(path.stem for path in session.path.glob("*.parquet"))
-    return [*(["summary"] if session.has("summary.csv") else []), *names]
+    return [
+        *(["summary"] if session.has("summary.csv") else []),
+        *sorted(path.stem for path in session.path.glob("*.parquet")),
+    ]
 
 
 def session_address(key: str, at_s: float | None = None) -> str:

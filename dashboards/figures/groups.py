@@ -112,8 +112,14 @@ def occupancy_by_subject(animals: Sequence[SessionAnimal]) -> Figure | None:
     panels = []
     for group, subjects in _occupancies(animals).items():
         for subject, (session, found) in subjects.items():
-            text = f"{subject} ({group}), {found.observed_s:.1f} s\nn = {counted(found.n, 'frame')}"
-            panels.append((text, session, found))
+            panels.append(
+                (
+                    f"{subject} ({group}), {found.observed_s:.1f} s\n"
+                    f"n = {counted(found.n, 'frame')}",
+                    session,
+                    found,
+                )
+            )
     return occupancy_panels(f"Occupancy by subject, n = {counted(len(panels), 'subject')}", panels)
 
 
@@ -152,8 +158,14 @@ def budgets_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
         colour = group_colour(group, list(groups))
         at = np.arange(len(words)) + (g - (len(groups) - 1) / 2) * apart
         mean = 100.0 * np.nan_to_num(pd.DataFrame(values).mean())
-        label = f"{group}, n = {counted(len(values), 'subject')}"
-        axes.barh(at, mean, 0.9 * apart, color=colour, alpha=0.35, label=label)
+        axes.barh(
+            at,
+            mean,
+            0.9 * apart,
+            color=colour,
+            alpha=0.35,
+            label=f"{group}, n = {counted(len(values), 'subject')}",
+        )
         mark = GROUP_MARKS[g % len(GROUP_MARKS)]
         for one in values:
             axes.plot(100.0 * one, at, mark, color=colour, markersize=2.2, gid=f"subjects {group}")
@@ -314,8 +326,13 @@ def _strip(
         )
     if link is not None:
         keys = rows["key"].astype(str)
-        sizes = [counted(int(n), "session") for n in np.bincount(animal)]
-        of_animals = zip(keys.groupby(animal).first(), names_of, sizes, means, strict=True)
+        of_animals = zip(
+            keys.groupby(animal).first(),
+            names_of,
+            [counted(int(n), "session") for n in np.bincount(animal)],
+            means,
+            strict=True,
+        )
         large.set_urls(
             [
                 link(key) + quote(f"#animal {subject}, {n}: {mean:.4g}", "#")

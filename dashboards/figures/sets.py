@@ -235,8 +235,9 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
         table.attrs["accounted"] = str(document.get("accounted", ""))
         if "n_units_first" in stats:  # written by an earlier version
             ends = stats["contrast"].str.rpartition(" - ")
-            old = {"n_units_first": "n_reference", "n_units_second": "n_group"}
-            stats = stats.rename(columns=old).assign(group=ends[0], reference=ends[2])
+            stats = stats.rename(
+                columns={"n_units_first": "n_reference", "n_units_second": "n_group"}
+            ).assign(group=ends[0], reference=ends[2])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SessionError(
             f"{folder} should hold what `liex compare` writes, but: {error}; compare again"

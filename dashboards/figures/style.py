@@ -286,8 +286,9 @@ def on_page(svg: bytes, name: str, title: str) -> str:
     """
     text = svg.decode("utf-8")
     text = text[text.index("<svg") :]
-    extra = r"<metadata>.*?</metadata>|<style type=.*?</style>|<!--.*?-->"
-    text = re.sub(extra, "", text, flags=re.DOTALL).replace("xlink:href=", "href=")
+    text = re.sub(
+        r"<metadata>.*?</metadata>|<style type=.*?</style>|<!--.*?-->", "", text, flags=re.DOTALL
+    ).replace("xlink:href=", "href=")
     shape = "".join(re.findall(r'viewBox="[^"]*"', text)[:1])
     head = f'<svg {shape} role="img" aria-label="{escape(title)}">'
     text = re.sub(r"<svg[^>]*>", lambda _: head, text, count=1)

@@ -89,8 +89,12 @@ def ethogram(animal: SessionAnimal, span_s: Span | None = None) -> Figure | None
 
     draw(animal.lost_s, (-0.5, max(len(words), 1)), "no pose")
     for k, (word, colour) in enumerate(action_colours(words).items()):
-        own = bouts.loc[bouts["action"] == word, ["start_s", "stop_s"]].to_numpy(float)
-        draw(own, (k - 0.38, 0.76), f"bouts of {word}", colour)
+        draw(
+            bouts.loc[bouts["action"] == word, ["start_s", "stop_s"]].to_numpy(float),
+            (k - 0.38, 0.76),
+            f"bouts of {word}",
+            colour,
+        )
     name_rows(axes, [word.replace("_", " ") for word in words], least=1)
     _clock(axes, (first_s, last_s))
     return figure
@@ -122,8 +126,9 @@ def curves(
     time_s = animal.frames["time_s"].to_numpy(float)
     near = slice(*np.searchsorted(time_s, [first_s - _BESIDE_S, last_s + _BESIDE_S]))
     _, size = time_unit(last_s - first_s)
-    rearing = animal.bouts["action"].astype(str).str.startswith("rear")
-    rears = animal.bouts.loc[rearing, ["start_s", "stop_s", "action"]].to_numpy()
+    rears = animal.bouts.loc[
+        animal.bouts["action"].astype(str).str.startswith("rear"), ["start_s", "stop_s", "action"]
+    ].to_numpy()
     colours = action_colours(animal.words)
     for k, (title, unit, values, colour, from_zero) in enumerate(rows):
         axes = panel(figure, LEFT_MM, 8.0 + (len(rows) - 1 - k) * step, width, _CURVE_MM)
@@ -176,8 +181,11 @@ def walked(animal: SessionAnimal) -> tuple[Array, Array, int]:
     """
     assert animal.kinematics is not None
     step = animal.kinematics["step_mm"].to_numpy(float)
-    n = int(np.isfinite(step).sum())
-    return animal.kinematics["time_s"].to_numpy(float), np.cumsum(np.nan_to_num(step)) / 1000.0, n
+    return (
+        animal.kinematics["time_s"].to_numpy(float),
+        np.cumsum(np.nan_to_num(step)) / 1000.0,
+        int(np.isfinite(step).sum()),
+    )
 
 
 def speed_distribution(animal: SessionAnimal) -> Figure | None:
@@ -191,8 +199,14 @@ def speed_distribution(animal: SessionAnimal) -> Figure | None:
 def error_distribution(animal: SessionAnimal) -> Figure | None:
     """Share of the observed time at each predicted error; None if unknown."""
     values = animal.frames["predicted_error_mm"].to_numpy(float)
-    hold = hold_times(animal.frames["time_s"].to_numpy(float))
-    return distribution("Predicted error of a joint", animal, values, hold, "mm", PREDICTED_ERROR)
+    return distribution(
+        "Predicted error of a joint",
+        animal,
+        values,
+        hold_times(animal.frames["time_s"].to_numpy(float)),
+        "mm",
+        PREDICTED_ERROR,
+    )
 
 
 def distribution(
@@ -301,9 +315,8 @@ def time_budget(animal: SessionAnimal) -> Figure | None:
     heading(figure, f"Time budget, {animal.label}\nn = {counted(len(animal.bouts), 'bout')}")
     axes.barh(range(len(words)), shares, 0.76, color=[colours[word] for word in words])
     for k, (share, n) in enumerate(zip(shares, n_bouts, strict=True)):
-        count = "" if n is None else f"n = {n}"
         axes.annotate(
-            count,
+            "" if n is None else f"n = {n}",
             (share, k),
             (2, 0),
             textcoords="offset points",
@@ -390,8 +403,12 @@ def transitions(animal: SessionAnimal) -> Figure | None:
     figure = sheet(TWO_COLUMNS_MM, wide + 14.0 + (18.0 if side == wide else 0.0))
     _matrix(panel(figure, LEFT_MM - 1.0, 4.0 + 0.4 * (wide - side), side, side), words, found)
     left = LEFT_MM + wide + 2.0  # as wide as possible, for the names around the circle
-    graph = panel(figure, left, 4.0, TWO_COLUMNS_MM - 1.0 - left, wide - 6.0)
-    _graph(graph, words, found, action_colours(animal.words))
+    _graph(
+        panel(figure, left, 4.0, TWO_COLUMNS_MM - 1.0 - left, wide - 6.0),
+        words,
+        found,
+        action_colours(animal.words),
+    )
     n = int(np.nansum(found["n"]))
     heading(
         figure,
@@ -419,8 +436,15 @@ def _matrix(axes: Axes, words: list[str], found: dict[str, Array]) -> None:
         fill = (_against_chance(found, i, j), 0.05 + 0.5 * p) if known else SOFT
         axes.add_patch(Rectangle((j - 0.47, i - 0.47), 0.94, 0.94, facecolor=fill, linewidth=0.0))
         if known:
-            text = f"{100 * p:.0f}\n({100 * found['by_chance'][i, j]:.0f})"
-            axes.text(j, i, text, ha="center", va="center", size=small, linespacing=1.25)
+            axes.text(
+                j,
+                i,
+                f"{100 * p:.0f}\n({100 * found['by_chance'][i, j]:.0f})",
+                ha="center",
+                va="center",
+                size=small,
+                linespacing=1.25,
+            )
     names = [word.replace("_", " ") for word in words]
     counts = np.nansum(found["n"], axis=1).astype(int)
     axes.set(xlim=(-0.5, k - 0.5), ylim=(k - 0.5, -0.5))
@@ -465,8 +489,14 @@ def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[
     for word, (x, y) in zip(words, place, strict=True):
         text = word.replace("_", " ")
         across = "left" if x > 0.1 else "right" if x < -0.1 else "center"
-        up = "bottom" if y > 0.1 else "top" if y < -0.1 else "center"
-        axes.text(1.14 * x, 1.14 * y, text, ha=across, va=up, size=6.0)
+        axes.text(
+            1.14 * x,
+            1.14 * y,
+            text,
+            ha=across,
+            va="bottom" if y > 0.1 else "top" if y < -0.1 else "center",
+            size=6.0,
+        )
     axes.set(xlim=(-1.96, 1.96), ylim=(-1.41, 1.41), aspect="equal")
     axes.set_axis_off()
 
@@ -522,8 +552,12 @@ def _onsets(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
                 low, median, high = (
                     shown(some, curve.unit)[0] for some in (one.low, one.median, one.high)
                 )
-                unit = shown(1.0, curve.unit)[1]
                 found.append(
-                    (curve.title, unit, word, Around(one.time_s, low, median, high, one.n))
+                    (
+                        curve.title,
+                        shown(1.0, curve.unit)[1],
+                        word,
+                        Around(one.time_s, low, median, high, one.n),
+                    )
                 )
     return found

@@ -128,8 +128,13 @@ def _bones(
 
 def _depth(panel: Axes, depth: NDArray[Any], low: float, high: float, colours: str) -> None:
     """A depth image or height map without axes; unread pixels stay empty."""
-    shown = np.where(depth > 0, depth, np.nan).astype(float)
-    panel.imshow(shown, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
+    panel.imshow(
+        np.where(depth > 0, depth, np.nan).astype(float),
+        cmap=colours,
+        vmin=low,
+        vmax=high,
+        interpolation="nearest",
+    )
     panel.set(xticks=[], yticks=[])
 
 
@@ -150,8 +155,13 @@ def draw_sensitivity(results: Results, path: Path) -> Path:
             for variant, curve in one["sensitivity"].items():
                 name, colour, _ = METHODS[variant]
                 if number in curve.get("left_out", {}):
-                    reason = fill(f"{name} {curve['left_out'][number]}", 48)
-                    panel.text(0.04, 0.04, reason, fontsize=6, transform=panel.transAxes)
+                    panel.text(
+                        0.04,
+                        0.04,
+                        fill(f"{name} {curve['left_out'][number]}", 48),
+                        fontsize=6,
+                        transform=panel.transAxes,
+                    )
                     continue
                 points = {p["value"]: p["mean_mm"] for p in curve["curves"].get(number, [])}
                 panel.plot([*points], [*points.values()], ".-", color=colour, label=name)
@@ -211,8 +221,12 @@ def draw_joint_errors(results: Results, path: Path) -> Path:
         for (name, colour, style), numbers in rows.items():
             if numbers["joint_mm"]:
                 panel.plot(numbers["joint_mm"], style, marker=".", color=colour, label=name)
-        turn = 60 if len(one["joints"]) > 6 else 0
-        panel.set_xticks(range(len(one["joints"])), one["joints"], rotation=turn, fontsize=7)
+        panel.set_xticks(
+            range(len(one["joints"])),
+            one["joints"],
+            rotation=60 if len(one["joints"]) > 6 else 0,
+            fontsize=7,
+        )
         panel.set(ylabel="mean error, mm", ylim=(0, None))
     panels[0][0].legend(fontsize=7)
     return _save(figure, path)
@@ -236,8 +250,12 @@ def draw_poses(
     """
     figure, grid = _sheet(len(rows), max(1, *map(len, rows.values())), 1.65, 2.1, (1.3, 0.6))
     for line, (name, frames) in zip(grid, rows.items(), strict=True):
-        label = METHODS[name][0].replace(", ", ",\n") if name in METHODS else name
-        line[0].set_ylabel(_NYU_METHODS.get(name, label), fontsize=8)
+        line[0].set_ylabel(
+            _NYU_METHODS.get(
+                name, METHODS[name][0].replace(", ", ",\n") if name in METHODS else name
+            ),
+            fontsize=8,
+        )
         for panel in line[len(frames) :]:
             panel.set_axis_off()
         for panel, one in zip(line, frames, strict=False):

@@ -208,8 +208,11 @@ def png(rgb: NDArray[np.uint8], fast: bool = False) -> bytes:
     Raises:
         SessionError: it cannot be encoded.
     """
-    how = [cv2.IMWRITE_PNG_COMPRESSION, 1] if fast else []
-    done, encoded = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]), how)
+    done, encoded = cv2.imencode(
+        ".png",
+        np.ascontiguousarray(rgb[..., ::-1]),
+        [cv2.IMWRITE_PNG_COMPRESSION, 1] if fast else [],
+    )
     if not done:
         raise SessionError("the image cannot be encoded as PNG")
     return bytes(encoded)

@@ -237,8 +237,14 @@ def write_clips(
             count = f"n = {len(some)} of {total}" if len(some) < total else f"n = {total}"
             group = name or (NO_GROUP if len(chosen) > 1 else "")
             heads[name] = ", ".join(filter(None, (group, what, count)))
-        after_s = np.arange(max(round(longest * fps * slower), 1)) / (fps * slower)
-        _write(path, fps, after_s, slower, lambda t: _grid(chosen, heads, t), progress)
+        _write(
+            path,
+            fps,
+            np.arange(max(round(longest * fps * slower), 1)) / (fps * slower),
+            slower,
+            lambda t: _grid(chosen, heads, t),
+            progress,
+        )
     return path
 
 

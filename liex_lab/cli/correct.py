@@ -137,8 +137,15 @@ def list_corrections(session: SessionPath) -> None:
     rows = []
     for entry in log.entries:
         what = f"{entry.undoes} taken back" if entry.what is None else entry.what
-        state = "" if entry.what is None or entry.number in standing else "taken back"
-        rows.append((entry.number, what, entry.author, entry.made_at, state))
+        rows.append(
+            (
+                entry.number,
+                what,
+                entry.author,
+                entry.made_at,
+                "" if entry.what is None or entry.number in standing else "taken back",
+            )
+        )
     print_table(rows, "", "what", "by", "at", "")
     if log.standing and not applies(log, opened.path, opened.metadata):
         say(

@@ -399,6 +399,8 @@ def _tell_session(session: Path, further: str = "") -> int:
         say(further)
     verdict = read_verdict(session)
     if verdict["sentence"]:
-        colour = typer.colors.YELLOW if verdict["look_at_it"] else None
-        typer.secho(f"result:  {printable(verdict['sentence'])}", fg=colour)
+        typer.secho(
+            f"result:  {printable(verdict['sentence'])}",
+            fg=typer.colors.YELLOW if verdict["look_at_it"] else None,
+        )
     return MisfitError.exit_code if verdict["look_at_it"] and not verdict["accepted"] else 0

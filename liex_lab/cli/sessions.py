@@ -399,8 +399,14 @@ def pack(
     """Pack a recording into a lossless archive of half its size, which all commands read."""
     if whole and region is not None:
         raise typer.BadParameter("--whole keeps every pixel; leave out --region or --whole")
-    asked = [*region_setting(region), *([] if topic is None else [f"recording.topic={topic}"])]
-    chosen = load_plan(plan, [*asked, *(settings or [])])
+    chosen = load_plan(
+        plan,
+        [
+            *region_setting(region),
+            *([] if topic is None else [f"recording.topic={topic}"]),
+            *(settings or []),
+        ],
+    )
     with progress_bar() as progress:
         done = api.pack(
             recording,

@@ -332,8 +332,10 @@ def one_hour(
     """
     usual = float(np.median(np.diff(one.track.times_ns))) * 1e-9
     n = round(hour_s / usual)
-    again = one[np.arange(n) % len(one)].track
-    hour = replace(again, times_ns=np.round(np.arange(n) * usual * 1e9).astype(np.int64))
+    hour = replace(
+        one[np.arange(n) % len(one)].track,
+        times_ns=np.round(np.arange(n) * usual * 1e9).astype(np.int64),
+    )
     wall = None if one.wall_mm is None else one.wall_mm[np.arange(n) % len(one)]
     recognise(recogniser, one.track, one.wall_mm)  # compiles
     began = time.perf_counter()
@@ -374,9 +376,14 @@ def speed_only(
     tree = DecisionTreeClassifier(
         max_depth=8, class_weight="balanced", min_samples_leaf=50, random_state=0
     ).fit(x, y)
-    named = [word for word in recogniser.words if word]
     return float(
-        f1_score(true, tree.predict(asked), labels=named, average="macro", zero_division=0.0)
+        f1_score(
+            true,
+            tree.predict(asked),
+            labels=[word for word in recogniser.words if word],
+            average="macro",
+            zero_division=0.0,
+        )
     )
 
 

@@ -348,8 +348,9 @@ def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) ->
                 above,
             )
         )
-    clips = np.repeat(np.arange(len(points)), _PER_RECORDING)
-    return PointMotion(np.concatenate(points), clips, 1e9 / FRAME_NS)
+    return PointMotion(
+        np.concatenate(points), np.repeat(np.arange(len(points)), _PER_RECORDING), 1e9 / FRAME_NS
+    )
 
 
 def _postures(skeleton: Skeleton) -> Bodies:

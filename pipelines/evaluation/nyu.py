@@ -125,8 +125,11 @@ def evaluate_nyu(
     numbers = frame_numbers_in(folder, len(labels.truth))
     ours, points = _ours(folder, labels.truth, numbers, model, progress)
     if figure is not None:
-        title = "NYU test frames, 14 points: labels, blue; answer, red"
-        draw_poses(title, shown_hands(labels, numbers, points), figure)
+        draw_poses(
+            "NYU test frames, 14 points: labels, blue; answer, red",
+            shown_hands(labels, numbers, points),
+            figure,
+        )
     published, same = {}, {}
     for name, answer in labels.answers.items():
         published[name] = {"method": _PUBLISHED.get(name, name), **nyu_errors(answer, labels.truth)}
@@ -172,8 +175,12 @@ def shown_hands(
 
 def labels_used(numbers: Numbers) -> str:
     """A sentence on test labels in our hand model, for frame numbers (n,) from 1 on."""
-    n = int((numbers <= N_FIRST_PERSON).sum())
-    return _LABELS.format(share=100 * OBSERVED_SHARE, last=N_FIRST_PERSON, n=n, of=len(numbers))
+    return _LABELS.format(
+        share=100 * OBSERVED_SHARE,
+        last=N_FIRST_PERSON,
+        n=int((numbers <= N_FIRST_PERSON).sum()),
+        of=len(numbers),
+    )
 
 
 def frame_numbers_in(folder: Path, n_labelled: int) -> Numbers:
@@ -233,13 +240,13 @@ def _ours(
         weights = points_of_joints(skeleton)
         # frames in memory at a time
         for frames in recording.chunks(32):
-            depths = np.stack([frame.depth for frame in frames])
-            joints = estimator.estimate(depths, scene, size).chosen.pose.joints(skeleton)
+            joints = estimator.estimate(
+                np.stack([frame.depth for frame in frames]), scene, size
+            ).chosen.pose.joints(skeleton)
             points[[frame.index for frame in frames]] = weights @ joints
             progress(frames[-1].index + 1, len(recording), "measuring hands")
-    ours = {
+    return {
         "method": "liex_lab, default",
         "spine_mm": size * skeleton.length,
         **nyu_errors(points, truth[numbers - 1]),
-    }
-    return ours, points
+    }, points

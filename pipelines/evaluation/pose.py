@@ -351,8 +351,13 @@ def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Bui
     except EstimationError:
         lost = Track.empty(skeleton, recording.times_ns)
         return Built(lost, recording.joints_arena, recording.spine_mm, np.nan, skeleton.tip)
-    tracked = track_whole(each.subject, each.observations).track
-    return Built(tracked, each.truth, recording.spine_mm, each.subject.length_mm, skeleton.tip)
+    return Built(
+        track_whole(each.subject, each.observations).track,
+        each.truth,
+        recording.spine_mm,
+        each.subject.length_mm,
+        skeleton.tip,
+    )
 
 
 def build_figures(rows: Sequence[Built], joints: Sequence[str]) -> dict[str, Any]:

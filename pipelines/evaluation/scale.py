@@ -381,8 +381,12 @@ def _measure_short(
     observed = Observations.join([tracker.observe(frames) for frames in short.chunks(32)])
     camera = short.camera.every(_COARSER)
     depth = [np.ascontiguousarray(frame.depth[::_COARSER, ::_COARSER]) for frame in short]
-    origin = replace(build_provenance(short, plan, tracker), camera=camera, gaps=())
-    return depth, observed, replace(tracker.subject, camera=camera), origin
+    return (
+        depth,
+        observed,
+        replace(tracker.subject, camera=camera),
+        replace(build_provenance(short, plan, tracker), camera=camera, gaps=()),
+    )
 
 
 def _parts(
@@ -393,8 +397,10 @@ def _parts(
     for start in range(0, n, _BLOCK):
         rows = all_rows[start : start + _BLOCK]
         times = (start + np.arange(len(rows), dtype=np.int64)) * STEP_NS
-        columns = {name: getattr(observed, name)[rows] for name in COLUMNS}
-        part = Observations(observed.skeleton, **columns | {"times_ns": times})
+        part = Observations(
+            observed.skeleton,
+            **{name: getattr(observed, name)[rows] for name in COLUMNS} | {"times_ns": times},
+        )
         yield (
             [DepthFrame(start + k, int(times[k]), depth[row]) for k, row in enumerate(rows)],
             part,

@@ -178,6 +178,9 @@ def read_individuals(session: Session) -> list[MeasuredIndividual]:
         )
         if mirrored:
             joints = joints * [-1.0, 1.0, 1.0]
-        trusted = (frames["flag"] == "").to_numpy(bool) & np.isfinite(joints).all(axis=(1, 2))
-        found.append(MeasuredIndividual(joints, trusted))
+        found.append(
+            MeasuredIndividual(
+                joints, (frames["flag"] == "").to_numpy(bool) & np.isfinite(joints).all(axis=(1, 2))
+            )
+        )
     return found

@@ -139,8 +139,13 @@ def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str
     words = [json.dumps(one if isinstance(one, int | float) else str(one)) for one in arguments]
     environment = os.environ | dict.fromkeys(_ONE_THREAD if one_thread else (), "1")
     began = time.perf_counter()
-    command = own_python("-c", _CHILD, job, *words)
-    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        own_python("-c", _CHILD, job, *words),
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     seconds = time.perf_counter() - began
     if ran.returncode:
         raise LiexError(
@@ -208,8 +213,9 @@ class SpeedSample:
         self, subject: PoseEstimator | Baseline, parallel: bool, n_repeats: int
     ) -> float:
         """Frames per second of a subject, on one core or on those that numba may use."""
-        job = partial(subject.estimate, self.frames, self.scene, self.size, parallel)
-        return len(self.frames) / best_seconds(job, n_repeats)
+        return len(self.frames) / best_seconds(
+            partial(subject.estimate, self.frames, self.scene, self.size, parallel), n_repeats
+        )
 
 
 def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dict[str, Any]:
@@ -227,8 +233,9 @@ def evaluate_speed(animal: str = "mouse", *, progress: Progress = silent) -> dic
     """
     progress(0, 5, "rendering frames")
     default = estimator_of(animal, "default")
-    recordings = world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2)
-    footage = SpeedSample.of(animal, recordings, default, N_FRAMES)
+    footage = SpeedSample.of(
+        animal, world_of(Skeleton.load(animal)).test_split("clean", n_sessions=2), default, N_FRAMES
+    )
     rivals = _rivals(animal, progress)
     with two_cores() as cores:
         progress(1, 5, "timing the default")
@@ -479,8 +486,9 @@ def write_with(
 def write_moseq(path: Path, camera: Camera, frames: Iterable[DepthFrame]) -> None:
     """Write a MoSeq session: depth.dat, depth_ts.txt in milliseconds and metadata.json."""
     path.mkdir()
-    about = json.dumps({"DepthResolution": [camera.width, camera.height]})
-    (path / "metadata.json").write_text(about, encoding="utf-8")
+    (path / "metadata.json").write_text(
+        json.dumps({"DepthResolution": [camera.width, camera.height]}), encoding="utf-8"
+    )
     lens = "".join(f"{name} = {getattr(camera, name)}\n" for name in ("fx", "fy", "cx", "cy"))
     (path / "camera.toml").write_text(f"[camera]\n{lens}", encoding="utf-8")
     with (path / "depth.dat").open("wb") as depth, (path / "depth_ts.txt").open("w") as stamps:
@@ -530,8 +538,11 @@ def evaluate_recordings(
             (_SMALL, small, n_hour // share, 1),
         ):
             with tempfile.TemporaryDirectory(prefix="liex-") as scratch:
-                frames = (DepthFrame(k, (k + 1) * STEP_NS, some[k % len(some)]) for k in range(n))
-                write(Path(scratch) / file, lens, frames)
+                write(
+                    Path(scratch) / file,
+                    lens,
+                    (DepthFrame(k, (k + 1) * STEP_NS, some[k % len(some)]) for k in range(n)),
+                )
                 read.append(read_alone(Path(scratch) / file, repeats))
         full, short, long = read
         for key, value in {

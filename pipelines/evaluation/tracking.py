@@ -185,9 +185,14 @@ def follow_sequence(
 
     rows = {"single": row(single_frames(tracker.subject, observed), single_s)}
     progress(0, n, f"Algorithm 3 on {recording.name}")
-    noise = ProcessNoise.of(estimator.skeleton.name)
     rows["algorithm3"] = follow(
-        recording, estimator, tracker.scene, tracker.size, noise, 0, plan.seed
+        recording,
+        estimator,
+        tracker.scene,
+        tracker.size,
+        ProcessNoise.of(estimator.skeleton.name),
+        0,
+        plan.seed,
     )
     for name, job in (
         ("online", _online),
@@ -238,8 +243,15 @@ def paper_rows(
     found = {SINGLE: _single(recording, paper, scene, size)}
     for k, (name, base_rounds) in enumerate(BASE_ROUNDS.items()):
         progress(k + 1, len(PAPER_ROWS), f"Algorithm 3 as the paper has it on {recording.name}")
-        noise = ProcessNoise.of(paper.skeleton.name, "paper", base_rounds)
-        found[name] = follow(recording, paper, scene, size, noise, base_rounds, plan.seed)
+        found[name] = follow(
+            recording,
+            paper,
+            scene,
+            size,
+            ProcessNoise.of(paper.skeleton.name, "paper", base_rounds),
+            base_rounds,
+            plan.seed,
+        )
     return found
 
 

@@ -244,8 +244,10 @@ class _Claim:
         factor = np.interp(
             np.log(self.stated), *np.array([(np.log(stated), factor) for stated, factor in knots]).T
         )
-        sd = np.hypot(factor[:, None] * self.sd, self.stretch_sd(*stretch) * self.away)
-        return np.asarray(self.deviation / sd[..., None])
+        return np.asarray(
+            self.deviation
+            / np.hypot(factor[:, None] * self.sd, self.stretch_sd(*stretch) * self.away)[..., None]
+        )
 
 
 def calibrate_joints(
@@ -347,11 +349,19 @@ def calibrate_each_joint(
         return plain
     off: dict[str, list[Array]] = {}
     for each in measured:
-        stretch = plain.motion.stretch_sd(each.blur, each.size_spread)
-        track = _track(replace(each, subject=replace(each.subject, stretch_sd=stretch)), plain)
+        track = _track(
+            replace(
+                each,
+                subject=replace(
+                    each.subject, stretch_sd=plain.motion.stretch_sd(each.blur, each.size_spread)
+                ),
+            ),
+            plain,
+        )
         there = track.posed
-        deviation = np.abs(track.joints_mm[there] - each.truth[there])
-        off.setdefault(each.kind, []).append(deviation / track.sd_mm[there][..., None])
+        off.setdefault(each.kind, []).append(
+            np.abs(track.joints_mm[there] - each.truth[there]) / track.sd_mm[there][..., None]
+        )
     # bounds of the coverage of each joint's 90 % intervals, by kind
     low, high = (
         np.stack([np.quantile(np.concatenate(z), held, axis=(0, 2)) for z in off.values()]) / _Z90

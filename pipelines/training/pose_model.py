@@ -380,8 +380,13 @@ def cut_out(
         The images of the first components of all patches, then those of the second ones.
     """
     size = windows.spine_mm / skeleton.length
-    shown = size if method.session_size else np.ones(len(size))
-    crops, crop_cameras = extract(skeleton, windows, shown, method.camera_view, n_candidates=2)
+    crops, crop_cameras = extract(
+        skeleton,
+        windows,
+        size if method.session_size else np.ones(len(size)),
+        method.camera_view,
+        n_candidates=2,
+    )
     n = len(size)
     return TrainingSet.join(
         [
@@ -413,8 +418,9 @@ def extract(
     """
     origin = windows.origin.astype(float)
     if skeleton.view.foreground == FOREGROUNDS[1]:
-        hands = HandPatches(windows.depth, windows.intrinsics, origin, skeleton.view)
-        return hands.extract(size, camera_view, n_candidates=n_candidates)
+        return HandPatches(windows.depth, windows.intrinsics, origin, skeleton.view).extract(
+            size, camera_view, n_candidates=n_candidates
+        )
     depth, background = (
         image if windows.unit_mm == 1.0 else image * np.float32(windows.unit_mm)
         for image in (windows.depth, windows.background)

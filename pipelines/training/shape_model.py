@@ -83,8 +83,9 @@ def left_over(prior: ShapePrior, others: Sequence[MiniSession]) -> tuple[float, 
     Returns:
         Standard deviations over the length, of all joints together.
     """
-    left = np.stack([labels - prior.predict(clues) for clues, labels in others])
-    joints = left[:, : -2 * len(PLACES)].reshape(len(others), -1, 3)
+    joints = np.stack([labels - prior.predict(clues) for clues, labels in others])[
+        :, : -2 * len(PLACES)
+    ].reshape(len(others), -1, 3)
     height, along = (round(float(np.sqrt(np.mean(joints[..., k] ** 2))), 4) for k in (2, 0))
     return height, along
 

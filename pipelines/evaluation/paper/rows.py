@@ -282,8 +282,9 @@ def rates_of(
     rates = {}
     with two_cores() as cores:
         for name, subject in subjects.items():
-            own = replace(footage, size=subject.find_size(footage.sample, footage.scene))
-            rates[name] = own.frames_per_s(subject, True, _RATE_REPEATS)
+            rates[name] = replace(
+                footage, size=subject.find_size(footage.sample, footage.scene)
+            ).frames_per_s(subject, True, _RATE_REPEATS)
     return {
         name: {
             "frames_per_s": rate,

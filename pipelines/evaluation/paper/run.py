@@ -249,8 +249,10 @@ def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
         "rows": {name: _rounded(row) for name, row in kept.items() if name != "default"},
         "sensitivity": curves,
     }
-    text = json.dumps(content, indent=1, sort_keys=True, allow_nan=False)
-    path.write_text(_DEEP.sub("", text) + "\n", encoding="utf-8")
+    path.write_text(
+        _DEEP.sub("", json.dumps(content, indent=1, sort_keys=True, allow_nan=False)) + "\n",
+        encoding="utf-8",
+    )
     return path
 
 
@@ -421,8 +423,14 @@ def quick_runs(animal: str, variant: str, progress: Progress = silent) -> list[S
         training = replace(
             training, plan=replace(training.plan, width=0.25, connected=128, epochs=1)
         )
-    method = replace(method_of("paper", skeleton), session_size=False)
-    data = rendered_set(skeleton, method, training.recipe, 0, _QUICK_IMAGES[variant], silent)
+    data = rendered_set(
+        skeleton,
+        replace(method_of("paper", skeleton), session_size=False),
+        training.recipe,
+        0,
+        _QUICK_IMAGES[variant],
+        silent,
+    )
     return [fit(training, data, skeleton, lambda share, what: None)]
 
 
