@@ -12,7 +12,6 @@ tail needs that frame's z up and its floor at z = 0.
 """
 
 import math
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,24 +26,6 @@ TAIL_RINGS = 12
 TAIL_SEGMENTS = 6
 CAPSULE_RINGS = 6
 CAPSULE_SEGMENTS = 10
-
-
-class TubeBodies(NamedTuple):
-    """The shapes of n animals with a tubular body, see `BodyShape`.
-
-    Attributes:
-        half_width: (n, R) mm.
-        half_height: (n, R) mm.
-        power: (n,) of the superellipses.
-        blobs: (n, B, 6) ellipsoids.
-        tail: (n, 3) length, radius at the rump, radius at the tip.
-    """
-
-    half_width: Any
-    half_height: Any
-    power: Any
-    blobs: Any
-    tail: Any
 
 
 def tube_faces(n_rings: int, n_segments: int) -> NDArray[np.int32]:
@@ -306,64 +287,69 @@ def _tail(joints, rotations, arc, girth, first, tail, bends, frame, out, start):
     return at + 1
 
 
-@kernel()
-def skin_tube(
-    joints, rotations, girth, stations, half_width, half_height, power, blobs, tail, bends, out
-):
-    """Vertices of one animal with a tubular body: trunk, ellipsoids, tail; see `BodyShape`.
-
-    Args:
-        joints: (J, 3) mm of a chain.
-        rotations: (J, 3, 3) of its joints.
-        girth: multiplies all lengths of the shape.
-        stations: (R,) shares of the spine's length.
-        half_width: (R,) mm.
-        half_height: (R,) mm.
-        power: of the superellipse.
-        blobs: (B, 6) ellipsoids.
-        tail: (3,) length, radius at the rump, radius at the tip.
-        bends: (TAIL_RINGS,) rad.
-        out: (V, 3) mm, out.
-    """
-    arc = np.empty(joints.shape[0])
-    frame = np.empty((4, 3))
-    chain_arc(joints, arc)
-    at = _body(
-        joints, rotations, arc, girth, stations, half_width, half_height, power, frame, out, 0
-    )
-    for b in range(blobs.shape[0]):
-        at = _blob(joints, rotations, arc, girth, blobs[b], frame, out, at)
-    _tail(joints, rotations, arc, girth, stations[0], tail, bends, frame, out, at)
-
-
 @kernel(nogil=True)
-def skin_tubes(joints, rotations, girth, stations, bodies, bends, out, start, stop):
-    """`skin_tube` for a batch.
+def skin_tubes(
+    joints,
+    rotations,
+    girth,
+    stations,
+    half_width,
+    half_height,
+    power,
+    blobs,
+    tail,
+    bends,
+    out,
+    start,
+    stop,
+):
+    """Vertices of n animals with tubular bodies: trunk, ellipsoids, tail; see `BodyShape`.
 
     Args:
-        joints: (n, J, 3) mm.
-        rotations: (n, J, 3, 3).
-        girth: (n,).
-        stations: (R,), shared.
-        bodies: `TubeBodies`.
+        joints: (n, J, 3) mm of chains.
+        rotations: (n, J, 3, 3) of their joints.
+        girth: (n,) multiplies all lengths of the shape.
+        stations: (R,) shares of the spine's length, shared.
+        half_width: (n, R) mm.
+        half_height: (n, R) mm.
+        power: (n,) of the superellipses.
+        blobs: (n, B, 6) ellipsoids.
+        tail: (n, 3) length, radius at the rump, radius at the tip.
         bends: (n, TAIL_RINGS) rad.
         out: (n, V, 3) mm, out.
         start: first item to process, see `in_parallel`.
         stop: the item after the last.
     """
     for i in range(start, stop):
-        skin_tube(
+        arc = np.empty(joints.shape[1])
+        frame = np.empty((4, 3))
+        chain_arc(joints[i], arc)
+        at = _body(
             joints[i],
             rotations[i],
+            arc,
             girth[i],
             stations,
-            bodies.half_width[i],
-            bodies.half_height[i],
-            bodies.power[i],
-            bodies.blobs[i],
-            bodies.tail[i],
-            bends[i],
+            half_width[i],
+            half_height[i],
+            power[i],
+            frame,
             out[i],
+            0,
+        )
+        for b in range(blobs.shape[1]):
+            at = _blob(joints[i], rotations[i], arc, girth[i], blobs[i, b], frame, out[i], at)
+        _tail(
+            joints[i],
+            rotations[i],
+            arc,
+            girth[i],
+            stations[0],
+            tail[i],
+            bends[i],
+            frame,
+            out[i],
+            at,
         )
 
 

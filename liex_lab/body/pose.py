@@ -86,43 +86,6 @@ def _unit(v: Array) -> Array:
     return v / _length(v)
 
 
-def chain_from_joints(skeleton: Skeleton, joints: Array, up: Array) -> tuple[SE3, Array, Array]:
-    """Root, angles and scale of the chain through given joint positions.
-
-    For skeletons of one chain (mouse, fish): every joint but the last has exactly one child.
-
-    Args:
-        skeleton: one chain of joints.
-        joints: (..., J, 3) mm.
-        up: (3,) or (..., 3), desired direction of the base's z axis; if the base's bone is parallel
-            to it, another axis is used.
-
-    Returns:
-        Root (...), angles (..., J, 3) rad and scale (...).
-    """
-    children = skeleton.next_joint
-    along = joints[..., 1:, :] - joints[..., skeleton.parents[1:], :]
-    length = np.linalg.norm(along, axis=-1)
-    scale = length.sum(-1) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
-    forward = _unit(along[..., 0, :] * np.sign(skeleton.offsets[children[0], 0]))
-    # a base that points straight up or down has no yaw: use the next axis
-    up = np.broadcast_to(up, forward.shape)
-    vertical = np.abs(np.sum(forward * up, axis=-1, keepdims=True)) > 0.999 * _length(up)
-    side = _unit(so3.cross(np.where(vertical, np.roll(up, 1, axis=-1), up), forward))
-    rotation = np.stack([forward, side, so3.cross(forward, side)], axis=-1)
-    root = SE3(rotation, joints[..., 0, :])
-    angles = np.zeros(joints.shape)
-    for j in range(1, skeleton.n_joints):
-        rotation = rotation @ skeleton.rest[j]
-        child = children[j]
-        if child < 0:
-            continue
-        wanted = np.einsum("...ji,...j->...i", rotation, joints[..., child, :] - joints[..., j, :])
-        angles[..., j, :] = aim(skeleton.offsets[child], wanted)
-        rotation = rotation @ so3.exp(angles[..., j, :])
-    return root, angles, scale
-
-
 # A skeleton's kinematic tree as a record of arrays for numba kernels.
 
 
@@ -215,7 +178,30 @@ class Pose(Rows):
             joints: (..., J, 3) mm.
             up: (3,) or (..., 3), any length.
         """
-        return Pose(*chain_from_joints(skeleton, np.asarray(joints, float), np.asarray(up, float)))
+        joints, up = np.asarray(joints, float), np.asarray(up, float)
+        children = skeleton.next_joint
+        along = joints[..., 1:, :] - joints[..., skeleton.parents[1:], :]
+        length = np.linalg.norm(along, axis=-1)
+        scale = length.sum(-1) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
+        forward = _unit(along[..., 0, :] * np.sign(skeleton.offsets[children[0], 0]))
+        # a base that points straight up or down has no yaw: use the next axis
+        up = np.broadcast_to(up, forward.shape)
+        vertical = np.abs(np.sum(forward * up, axis=-1, keepdims=True)) > 0.999 * _length(up)
+        side = _unit(so3.cross(np.where(vertical, np.roll(up, 1, axis=-1), up), forward))
+        rotation = np.stack([forward, side, so3.cross(forward, side)], axis=-1)
+        root = SE3(rotation, joints[..., 0, :])
+        angles = np.zeros(joints.shape)
+        for j in range(1, skeleton.n_joints):
+            rotation = rotation @ skeleton.rest[j]
+            child = children[j]
+            if child < 0:
+                continue
+            wanted = np.einsum(
+                "...ji,...j->...i", rotation, joints[..., child, :] - joints[..., j, :]
+            )
+            angles[..., j, :] = aim(skeleton.offsets[child], wanted)
+            rotation = rotation @ so3.exp(angles[..., j, :])
+        return Pose(root, angles, scale)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ feet are ellipsoids, the tail is a thin tube. `Spheres` approximates any body al
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -488,48 +488,48 @@ class MeshBody(Body):
             positions,
             scale,
             girth,
-            _Skin(self.carriers, self.bones, self.weight, self.along, self.across),
+            self.carriers,
+            self.bones,
+            self.weight,
+            self.along,
+            self.across,
             body.width,
             out,
         )
         return out
 
 
-class _Skin(NamedTuple):
-    """How V vertices follow their B bones, see `MeshBody`.
-
-    Attributes:
-        carrier: (V, B) the joints that carry the bones.
-        bones: (V, B) the joints that end them.
-        weight: (V, B).
-        along: (V, B, 3) mm.
-        across: (V, B, 3) mm.
-    """
-
-    carrier: Any
-    bones: Any
-    weight: Any
-    along: Any
-    across: Any
-
-
 @kernel(nogil=True)
-def _skin_mesh(rotations, positions, scale, girth, skin, width, out, start, stop):
-    """Linear blend skinning of a batch into out (n, V, 3)."""
+def _skin_mesh(
+    rotations,
+    positions,
+    scale,
+    girth,
+    carrier,
+    bones,
+    weight,
+    along,
+    across,
+    width,
+    out,
+    start,
+    stop,
+):
+    """Linear blend skinning of a batch into out (n, V, 3); (V, B) arrays as in `MeshBody`."""
     for i in range(start, stop):
-        for v in range(len(skin.weight)):
+        for v in range(len(weight)):
             for axis in range(3):
                 out[i, v, axis] = 0.0
-            for b in range(skin.weight.shape[1]):
-                j = skin.carrier[v, b]
-                thick = girth[i] * 0.5 * (width[i, j] + width[i, skin.bones[v, b]])
+            for b in range(weight.shape[1]):
+                j = carrier[v, b]
+                thick = girth[i] * 0.5 * (width[i, j] + width[i, bones[v, b]])
                 for axis in range(3):
                     total = positions[i, j, axis]
                     for k in range(3):
                         total += rotations[i, j, axis, k] * (
-                            scale[i] * skin.along[v, b, k] + thick * skin.across[v, b, k]
+                            scale[i] * along[v, b, k] + thick * across[v, b, k]
                         )
-                    out[i, v, axis] += skin.weight[v, b] * total
+                    out[i, v, axis] += weight[v, b] * total
 
 
 # The surface around a skeleton as a triangle mesh, and its depth image.
@@ -608,8 +608,8 @@ class Surface:
     @property
     def n_trunk_vertices(self) -> int:
         """The leading vertices that belong to the trunk, without ears, feet and tail."""
-        n_rings = len(self.stations) - 2
-        return n_rings * skinning_kernels.BODY_SEGMENTS + 2 if n_rings > 0 else self.n_vertices
+        trunk = (len(self.stations) - 2) * skinning_kernels.BODY_SEGMENTS + 2
+        return trunk if len(self.stations) else self.n_vertices
 
     @property
     def n_trunk_faces(self) -> int:
@@ -688,9 +688,11 @@ class Surface:
                 rotations,
                 across,
                 self.stations,
-                skinning_kernels.TubeBodies(
-                    tube.half_width, tube.half_height, tube.power, tube.blobs, tube.tail
-                ),
+                tube.half_width,
+                tube.half_height,
+                tube.power,
+                tube.blobs,
+                tube.tail,
                 straight if bends is None else np.asarray(bends, float),
                 out,
             )

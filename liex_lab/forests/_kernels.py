@@ -26,9 +26,7 @@ import numpy as np
 
 from liex_lab.runtime.kernels import inner_kernel, kernel
 
-TWO_PROBES = 0
-ONE_PROBE = 1
-SCALAR = 2
+TWO_PROBES, ONE_PROBE, SCALAR = range(3)
 VIEW = 9
 # columns of a view, see above; each of the two slopes takes three
 VIEW_COLUMN = 0

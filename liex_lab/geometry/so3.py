@@ -84,16 +84,12 @@ def quaternion(rotation: ArrayLike) -> Array:
         (..., 4) as (w, x, y, z), w >= 0.
     """
     r = np.asarray(rotation, float)
-    d0 = r[..., 0, 0]
-    d1 = r[..., 1, 1]
-    d2 = r[..., 2, 2]
+    d0, d1, d2 = np.moveaxis(np.diagonal(r, axis1=-2, axis2=-1), -1, 0)
     squares = np.stack(
         [1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2], axis=-1
     )
     # row k: the quaternion times four times its component k
-    rows = np.empty((*squares.shape, 4))
-    for k in range(4):
-        rows[..., k, k] = squares[..., k]
+    rows = squares[..., None] * np.eye(4)
     for i, k, value in (
         (0, 1, r[..., 2, 1] - r[..., 1, 2]),
         (0, 2, r[..., 0, 2] - r[..., 2, 0]),

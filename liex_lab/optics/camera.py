@@ -399,12 +399,15 @@ def preset(name: str, width: int, height: int) -> Camera:
     Raises:
         LiexError: there is no such name, or that camera has no images of this size.
     """
-    cameras = PRESETS.get(name)
-    if cameras is None:
-        raise LiexError(
+    refuse(
+        LiexError,
+        (
+            name not in PRESETS,
             f"camera.preset is one of {', '.join(PRESETS)}, got '{name}'; choose one of them, or "
-            "state fx, fy, cx and cy"
-        )
+            "state fx, fy, cx and cy",
+        ),
+    )
+    cameras = PRESETS[name]
     for camera in cameras:
         if (camera.width, camera.height) == (width, height):
             return Camera(

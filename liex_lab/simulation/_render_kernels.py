@@ -93,22 +93,6 @@ def part_of(vertices: Any, faces: Any, label: int, shown: Any = None) -> Part:
     )
 
 
-class ArenaView(NamedTuple):
-    """Cameras above a floor with at most one wall, of n patches.
-
-    Attributes:
-        R_arena_camera: (n, 3, 3) rotation of the camera.
-        height: (n,) of the camera above the floor, mm.
-        wall: (n, WALL_COLUMNS) the wall.
-        rough: (n,) unevenness of the floor, mm.
-    """
-
-    R_arena_camera: Any
-    height: Any
-    wall: Any
-    rough: Any
-
-
 @kernel()
 def floor_and_wall(u0, v0, size, intrinsics, rotation, height, wall, uneven, rough, depth, what):
     """Ideal depth and kind of a patch (H, W) on a floor with at most one straight wall.
@@ -261,13 +245,28 @@ def _expose(
 
 
 @kernel(nogil=True)
-def draw_windows(parts, cameras, views, noises, depth_out, background_out, start, stop):
+def draw_windows(
+    parts,
+    cameras,
+    R_arena_camera,
+    height,
+    walls,
+    rough,
+    noises,
+    depth_out,
+    background_out,
+    start,
+    stop,
+):
     """Render training patches and their learned backgrounds.
 
     Args:
         parts: tuple of `Part` in the arena frame.
         cameras: `PatchCamera`.
-        views: `ArenaView`.
+        R_arena_camera: (n, 3, 3) rotation of the camera.
+        height: (n,) of the camera above the floor, mm.
+        walls: (n, WALL_COLUMNS) the wall.
+        rough: (n,) unevenness of the floor, mm.
         noises: `SensorNoise`.
         depth_out: (n, S, S) uint16 in steps of the sensor's unit, output, 0 = unread.
         background_out: (n, S, S) uint16 likewise, the still scene as learned from many frames.
@@ -288,11 +287,11 @@ def draw_windows(parts, cameras, views, noises, depth_out, background_out, start
             cameras.origin[i, 1],
             cameras.size[i],
             cameras.intrinsics[i],
-            views.R_arena_camera[i],
-            views.height[i],
-            views.wall[i],
+            R_arena_camera[i],
+            height[i],
+            walls[i],
             field,
-            views.rough[i],
+            rough[i],
             depth,
             what,
         )
@@ -304,8 +303,8 @@ def draw_windows(parts, cameras, views, noises, depth_out, background_out, start
                 background_out[i, r, c] = (
                     int((depth[r, c] + error) / sensor[UNIT] + 0.5) if depth[r, c] > 0.0 else 0
                 )
-        rotation = np.ascontiguousarray(views.R_arena_camera[i].T)
-        translation = -views.height[i] * rotation[:, 2]
+        rotation = np.ascontiguousarray(R_arena_camera[i].T)
+        translation = -height[i] * rotation[:, 2]
         _expose(
             parts,
             i,

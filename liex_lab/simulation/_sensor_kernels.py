@@ -19,14 +19,8 @@ import numpy as np
 
 from liex_lab.runtime.kernels import inner_kernel, kernel
 
-NOTHING = 0
-STILL = 1
-ANIMAL = 2
-OBJECT = 3
-
-PRIMESENSE_KIND = 0
-KINECT_V2_KIND = 1
-LIGHT_FIELD_KIND = 2
+NOTHING, STILL, ANIMAL, OBJECT = range(4)  # kinds of pixels
+PRIMESENSE_KIND, KINECT_V2_KIND, LIGHT_FIELD_KIND = range(3)
 BASELINE_MM = 75.0  # between the projector and the camera of a PrimeSense
 SUBPIXEL = 8.0  # its disparity is quantised to eighths of a pixel
 
@@ -47,11 +41,10 @@ SUBPIXEL = 8.0  # its disparity is quantised to eighths of a pixel
     GRID,
     JITTER,
     FLYING,
-) = range(15)
-# step of the depth image, mm; error of a learned background; rarity of outliers
-UNIT = 15
-BACKGROUND = 16
-OUTLIERS = 17
+    UNIT,  # step of the depth image, mm
+    BACKGROUND,  # error of a learned background
+    OUTLIERS,  # rarity of outliers
+) = range(18)
 N_PARAMETERS = 18
 # distance from a light field's main lens to which its parameters refer; range noise grows with z^2
 TYPICAL_MM = 250.0
@@ -65,12 +58,13 @@ _NEIGHBOURS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 _FIELDS = (1.0, 4.0, 2.0, 1.0, 1.5, 1.5)
 
 _TABLE_BITS = 13
-_SHIFT = 64 - _TABLE_BITS
 
 
 # quantiles of the standard normal distribution at 2^13 evenly spaced probabilities
-_PROBABILITIES = (np.arange(1 << _TABLE_BITS) + 0.5) / (1 << _TABLE_BITS)
-NORMAL = np.array([NormalDist().inv_cdf(p) for p in _PROBABILITIES], np.float32)
+NORMAL = np.array(
+    [NormalDist().inv_cdf(p) for p in (np.arange(1 << _TABLE_BITS) + 0.5) / (1 << _TABLE_BITS)],
+    np.float32,
+)
 
 
 @inner_kernel()
@@ -93,7 +87,7 @@ def uniform(state):
 @kernel()
 def normal(state, table):
     """A standard normal number by inversion, to the resolution of the quantile table (2^13,)."""
-    return table[np.int64(advance(state) >> np.uint64(_SHIFT))]
+    return table[np.int64(advance(state) >> np.uint64(64 - _TABLE_BITS))]
 
 
 @inner_kernel()

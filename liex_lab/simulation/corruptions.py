@@ -197,20 +197,18 @@ def beside_animal(
     """
     mesh = draw_object(rng, str(rng.choice(kinds)), length_mm)
     path = joints[..., :2].reshape(-1, 2)
-    best = np.zeros(2)
-    best_cost = np.inf
-    for _ in range(60):
-        place = joints[rng.integers(len(joints)), 0, :2] + rng.normal(0.0, 1.6, 2) * length_mm
-        reach = np.abs(mesh[:, :2]).max()
+    reach = np.abs(mesh[:, :2]).max()
+
+    def cost(place: Array) -> float:
         free = np.linalg.norm(path - place, axis=1).min() - reach
-        cost = (
-            abs(free - 0.5 * length_mm)
-            + max(0.0, reach - float(scene.wall_clearance(place)))
-            + 50.0 * (free < 0)
-        )
-        if cost < best_cost:
-            best = place
-            best_cost = cost
+        outside = max(0.0, reach - float(scene.wall_clearance(place)))
+        return float(abs(free - 0.5 * length_mm) + outside + 50.0 * (free < 0))
+
+    places = [
+        joints[rng.integers(len(joints)), 0, :2] + rng.normal(0.0, 1.6, 2) * length_mm
+        for _ in range(60)
+    ]
+    best = min(places, key=cost)
     return np.broadcast_to(mesh + np.array([*best, 0.0]), (len(joints), *mesh.shape))
 
 

@@ -107,17 +107,13 @@ def moving_session(
     length = float(spine_mm)
     scene = SimulatedScene.draw(rng, sensor.camera, length, species.setting)
     shape = species.shapes(rng, family, 1)
-    if isinstance(species, MouseSpecies):
-        assert isinstance(shape, BodyShape)
-        kind = "walking"
-        pose, girth = walk(rng, scene, species, shape, length, n_frames)
-    elif isinstance(species, FishSpecies):
-        kind = "swimming"
-        pose, girth = _swim(rng, scene, species, shape, length, n_frames)
-    else:
-        assert isinstance(species, GenericSpecies)
-        kind = "moving"
-        pose, girth = _roam(rng, scene, species, shape, length, n_frames)
+    moves: dict[type[Species], tuple[str, Callable[..., tuple[Pose, Array]]]] = {
+        MouseSpecies: ("walking", walk),
+        FishSpecies: ("swimming", _swim),
+        GenericSpecies: ("moving", _roam),
+    }
+    kind, move = moves[type(species)]
+    pose, girth = move(rng, scene, species, shape, length, n_frames)
     contents = assemble(
         rng, scene, sensor, species, length, shape, pose, girth, noise, erosion_px, object_share
     )

@@ -117,9 +117,9 @@ def draw_postures(
     reach = low.copy()
     reach[:, -1] = np.radians(rng.uniform(-40.0, 40.0, n))
     reach[:, -2] += np.radians(rng.uniform(-10.0, 25.0, n))
-    elevation = np.where(is_kind("rear"), tower, low)
-    elevation = np.where(is_kind("hunch"), arch, elevation)
-    elevation = np.where(is_kind("reach"), reach, elevation)
+    elevation = np.select(
+        [is_kind("rear"), is_kind("hunch"), is_kind("reach")], [tower, arch, reach], low
+    )
     return Posture(
         elevation,
         _draw_turns(rng, skeleton, is_kind("curl") | (rng.random((n, 1)) < 0.1), is_kind("reach")),

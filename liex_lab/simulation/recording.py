@@ -37,8 +37,6 @@ from liex_lab.simulation.species import MouseSpecies, Sensor, Species
 Array = NDArray[np.float64]
 
 FRAME_NS = MouseSpecies.frame_ns
-N_SESSIONS = 40
-N_FRAMES = 50
 OTHER_CAMERA = "other-camera"  # focal lengths and resolutions not used in training
 # name: (own seed, shape family, noise, eroded pixels, share of frames with another object in view)
 SPLITS = {
@@ -301,7 +299,7 @@ class SyntheticSession(TrueRecording):
     @staticmethod
     def draw(
         seed: int | list[int],
-        n_frames: int = N_FRAMES,
+        n_frames: int = 50,
         *,
         sensor: Sensor | None = None,
         family: str = "train",

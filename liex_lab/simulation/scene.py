@@ -25,23 +25,16 @@ Array = NDArray[np.float64]
 
 OBJECTS = ("block", "ball", "cable", "hand")
 N_PARTS = 8
-_RINGS = 7
-_SEGMENTS = 14
-SPHERE_TUBE = (_RINGS, _SEGMENTS)
-
-
-def _unit_sphere() -> Array:
-    """Vertices (V, 3) of a sphere as a tube: pole, rings, pole."""
-    rows = [[-1.0, 0.0, 0.0]]
-    for theta in np.pi * np.arange(1, _RINGS + 1) / (_RINGS + 1):
-        rows += [
-            [-np.cos(theta), np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi)]
-            for phi in 2 * np.pi * np.arange(_SEGMENTS) / _SEGMENTS
-        ]
-    return np.array([*rows, [1.0, 0.0, 0.0]])
-
-
-SPHERE = _unit_sphere()
+SPHERE_TUBE = _RINGS, _SEGMENTS = (7, 14)
+_THETA = np.pi * np.arange(1, _RINGS + 1)[:, None] / (_RINGS + 1)
+_PHI = 2 * np.pi * np.arange(_SEGMENTS) / _SEGMENTS
+_RING = np.broadcast_arrays(
+    -np.cos(_THETA), np.sin(_THETA) * np.cos(_PHI), np.sin(_THETA) * np.sin(_PHI)
+)
+# vertices (V, 3) of a sphere as a tube: pole, rings, pole
+SPHERE = np.concatenate(
+    [[[-1.0, 0.0, 0.0]], np.stack(_RING, axis=-1).reshape(-1, 3), [[1.0, 0.0, 0.0]]]
+)
 OBJECT_FACES = joined_faces([SPHERE_TUBE] * N_PARTS)
 PART_FACES = joined_faces([SPHERE_TUBE])
 
@@ -161,17 +154,6 @@ def _hand(rng: np.random.Generator, spine_mm: float) -> Parts:
     return parts
 
 
-_OBJECTS_BY_KIND = {
-    "block": _block,
-    "ball": _ball,
-    "pellet": _pellet,
-    "plant": _plant,
-    "fish": _fish,
-    "cable": _cable,
-    "hand": _hand,
-}
-
-
 def draw_object(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
     """Vertices of one random object on the floor around the origin.
 
@@ -186,7 +168,16 @@ def draw_object(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
     Returns:
         (N_PARTS * V, 3) mm, arena frame, with triangles as in `OBJECT_FACES`.
     """
-    return mesh_of(_OBJECTS_BY_KIND[kind](rng, spine_mm))
+    draw = {
+        "block": _block,
+        "ball": _ball,
+        "pellet": _pellet,
+        "plant": _plant,
+        "fish": _fish,
+        "cable": _cable,
+        "hand": _hand,
+    }[kind]
+    return mesh_of(draw(rng, spine_mm))
 
 
 ROUND = "round"
@@ -449,13 +440,32 @@ def draw_views(rng: np.random.Generator, m: int, setting: SceneSpec = ARENA) -> 
     """
     tilt = setting.tilt_rad * np.sqrt(rng.random(m))
     toward = rng.uniform(-np.pi, np.pi, m)
+    return look_down(rng.uniform(*setting.camera_mm, m), tilt, toward)
+
+
+def look_down(camera_mm: Array, tilt_rad: Array, toward_rad: Array) -> SE3:
+    """Poses of cameras above a floor.
+
+    Args:
+        camera_mm: (m,) their heights, mm.
+        tilt_rad: (m,) of their axes from the vertical, rad.
+        toward_rad: (m,) direction in the image that is tilted away from the floor, rad.
+
+    Returns:
+        (m) T_arena_camera; the arena frame's origin is at the camera's foot, its x along the
+        camera's.
+    """
     up = -np.stack(
-        [np.sin(tilt) * np.cos(toward), np.sin(tilt) * np.sin(toward), np.cos(tilt)], axis=-1
+        [
+            np.sin(tilt_rad) * np.cos(toward_rad),
+            np.sin(tilt_rad) * np.sin(toward_rad),
+            np.cos(tilt_rad),
+        ],
+        axis=-1,
     )
     x = np.array([1.0, 0.0, 0.0]) - up[:, :1] * up
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    height = rng.uniform(*setting.camera_mm, m)
-    translation = np.stack([np.zeros(m), np.zeros(m), height], axis=-1)
+    translation = camera_mm[:, None] * [0.0, 0.0, 1.0]
     return SE3(np.stack([x, np.cross(up, x), up], axis=-2), translation)
 
 

@@ -25,7 +25,6 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.simulation import corruptions, training_patches
 from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.hand.simulator import (
-    FRAME_NS,
     NYU_SENSOR,
     HandFrameContents,
     HandSession,
@@ -34,6 +33,7 @@ from liex_lab.simulation.hand.simulator import (
 )
 from liex_lab.simulation.locomotion import moving_session
 from liex_lab.simulation.recording import (
+    FRAME_NS,
     OTHER_CAMERA,
     SEALED_SEED,
     SPLITS,
@@ -151,13 +151,10 @@ def world_of(skeleton: Skeleton) -> Simulator:
     Returns:
         The simulator; that of the hand uses labelled test postures if `find_reference` finds any.
     """
-    if skeleton.name == "mouse":
-        return BodySimulator(MouseSpecies(skeleton))
-    if skeleton.name == "fish":
-        return BodySimulator(FishSpecies(skeleton))
     if skeleton.name == "hand":
         return HandSimulator(skeleton, find_reference())
-    return BodySimulator(GenericSpecies.of(skeleton))
+    known = {"mouse": MouseSpecies, "fish": FishSpecies}
+    return BodySimulator(known.get(skeleton.name, GenericSpecies.of)(skeleton))
 
 
 # Benchmark sequences for tracking: one moving animal, clean or corrupted, with exact truth.
@@ -339,13 +336,9 @@ def _with_objects(
 
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
 _SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
-_SCENE: Final = "scene"
-_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, _SCENE)
+_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, "scene")
 _SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
-_MOST_FRAMES = 100_000  # an hour; the truth of every frame is in memory
-_MOST_SCENE_FRAMES = 20_000  # cables and bedding are also in memory
-_SIZES = (0.5, 2.9)  # of the home length
 _BUILDS = ("other", "train")  # builds of animals in scenes: not used in training, or used
 
 
@@ -383,7 +376,7 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     )
     stated = dict(parse_qsl(query, keep_blank_values=True))
     session: Recording
-    if kind == _SCENE:
+    if kind == "scene":
         session = _open_scene(address, stated)
     else:
         usual = "mouse" if kind in _SEQUENCES else ""
@@ -424,7 +417,8 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
         )
     plan, _ = SCENES[named]
     kind = next(kind for kind, animal in _ANIMALS.items() if animal == plan)
-    settings = _settings(kind, Skeleton.load(plan).length, _MOST_SCENE_FRAMES)
+    # cables and bedding are in memory as well
+    settings = _settings(kind, Skeleton.load(plan).length, 20_000)
     if plan != "mouse":
         settings.pop("sensor", None)
     settings["build"] = (str, lambda build: build in _BUILDS, f"one of {', '.join(_BUILDS)}")
@@ -469,12 +463,12 @@ def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting])
 _Setting = tuple[Callable[[str], Any], Callable[[Any], bool], str]
 
 
-def _settings(kind: str, home_mm: float, most_frames: int = _MOST_FRAMES) -> dict[str, _Setting]:
+def _settings(kind: str, home_mm: float, most_frames: int = 100_000) -> dict[str, _Setting]:
     """For each setting: its parser, its check, and the expected value for the error message."""
     low, high = (
         (30.0, 150.0)
         if kind == "walk"
-        else (round(f * home_mm, -int(home_mm > 100)) for f in _SIZES)
+        else (round(f * home_mm, -int(home_mm > 100)) for f in (0.5, 2.9))
     )
     settings: dict[str, _Setting] = {
         "seed": (int, lambda seed: seed >= 0, "a whole number from 0 on"),

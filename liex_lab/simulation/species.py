@@ -411,11 +411,8 @@ class GenericSpecies(Species):
         poses = [
             centred(self.skeleton, angles, root_rotation(heading, t[0], t[1]), size) for t in tilts
         ]
-        height = []
-        for pose in poses:
-            z = pose.joints(self.skeleton)[..., 2]
-            height.append(z.mean(axis=1) - z.min(axis=1))
-        best = np.argmin(height, axis=0)
+        z = np.stack([pose.joints(self.skeleton)[..., 2] for pose in poses])
+        best = np.argmin(z.mean(axis=2) - z.min(axis=2), axis=0)
         # not all lie as low as possible
         best = np.where(rng.random(n) < 0.15, rng.integers(_TILTS, size=n), best)
         return Pose.join(poses)[best * n + np.arange(n)]

@@ -117,8 +117,7 @@ class Views(Rows):
         slope /= np.linalg.norm(slope, axis=-1, keepdims=True)
         normal = np.einsum("nji,nj->ni", self.T_arena_camera.rotation, slope)
         distance = self.T_arena_camera.translation[:, 2] + wrong[:, 2]
-        ab = normal[:, :2] / self.intrinsics[:, :2] / distance[:, None]
-        a, b = ab.T
+        a, b = (normal[:, k] / self.intrinsics[:, k] / distance for k in range(2))
         c = normal[:, 2] / distance - a * self.intrinsics[:, 2] - b * self.intrinsics[:, 3]
         return np.column_stack([a, b, c])
 
@@ -154,12 +153,10 @@ class Views(Rows):
             len(trunk),
             parts,
             render_kernels.PatchCamera(self.intrinsics, self.size_px, origin),
-            render_kernels.ArenaView(
-                self.T_arena_camera.rotation,
-                self.T_arena_camera.translation[:, 2].copy(),
-                walls,
-                self.rough,
-            ),
+            self.T_arena_camera.rotation,
+            self.T_arena_camera.translation[:, 2].copy(),
+            walls,
+            self.rough,
             render_kernels.SensorNoise(self.parameters, seeds, NORMAL),
             depth,
             background,

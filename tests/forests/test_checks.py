@@ -63,22 +63,6 @@ def test_roots_that_do_not_begin_whole_trees_are_refused():
             check_roots(roots, IS_LEAF)
 
 
-@given(st.lists(st.booleans(), min_size=1, max_size=15), st.data())
-def test_whatever_passes_is_numbered_within_its_arrays(flags, data):
-    """The kernel that numbers nodes is only asked where each tree fills its nodes exactly."""
-    is_leaf = np.array(flags)
-    roots = data.draw(st.lists(st.integers(-3, 17), min_size=1, max_size=4))
-    try:
-        check_roots(np.array(roots, np.int32), is_leaf)
-    except ValueError:
-        return
-    guarded = np.full((len(is_leaf) + 40, 4), 77, np.int32)
-    nodes = guarded[20 : 20 + len(is_leaf)]
-    number_nodes(is_leaf, np.append(roots, len(is_leaf)).astype(np.int64), nodes)
-    assert (guarded[:20] == 77).all()
-    assert (guarded[20 + len(is_leaf) :] == 77).all()
-
-
 def test_every_wrong_index_is_refused():
     beyond = (2**30, 2**31 - 1)
     wrong = [(replace(small(), roots=np.array([root, 5], np.int32)), "root") for root in (-1, 8)]

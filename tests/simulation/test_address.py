@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from liex_lab.catalog import find_sample
-from liex_lab.optics.camera import KINECT_V2, PRIMESENSE_QVGA, RAYTRIX_R5, Lens
+from liex_lab.optics.camera import KINECT_V2, PRIMESENSE_QVGA, Lens
 from liex_lab.recordings import open_recording
-from liex_lab.simulation.locomotion import moving_session, walking_session
+from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.species import FishSpecies
 from tests.recordings.asking import refusal
 
 ADDRESS = "synthetic:walk?seed=3&frames=6&sensor=primesense-qvga&spine_mm=70"
@@ -66,17 +65,6 @@ def test_a_stated_camera_changes_what_is_believed_and_not_the_pictures() -> None
     assert (wrong.camera.fx, wrong.camera.width, wrong.camera.height) == (300.0, 320, 240)
     np.testing.assert_array_equal(wrong.frame(2).depth, open_recording(ADDRESS).frame(2).depth)
     assert "512 x 424" in refusal(Path(ADDRESS), camera=KINECT_V2)
-
-
-def test_a_fish_swims_before_a_light_field_camera_at_50_frames_a_second() -> None:
-    fish = open_recording("synthetic:swim?seed=2&frames=3&spine_mm=28")
-    assert isinstance(fish, SyntheticSession)
-    assert (fish.name, fish.camera) == ("synthetic-swim-2", RAYTRIX_R5)
-    assert fish.rate_hz == pytest.approx(50.0)
-    assert (fish.spine_mm, fish.skeleton.name) == (28.0, "fish")
-    np.testing.assert_array_equal(
-        fish.frame(1).depth, moving_session(FishSpecies(), 2, 3, spine_mm=28.0).frame(1).depth
-    )
 
 
 def test_any_animal_moves_that_a_toml_describes() -> None:

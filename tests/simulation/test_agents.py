@@ -28,7 +28,7 @@ def mouse() -> mouse_acts.MouseActor:
     )
 
 
-def measured(fish: fish_acts.FishActor, word: str, n: int = 8) -> dict[str, np.ndarray]:
+def measured(fish: fish_acts.FishActor, word: str, n: int = 15) -> dict[str, np.ndarray]:
     """Of n actions: length s, mean speed and climb in lengths (a second), net turn and largest bend
     in degrees.
     """

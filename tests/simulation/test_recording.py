@@ -168,7 +168,7 @@ def test_other_cameras_have_a_focal_length_outside_the_training(animal: str) -> 
 
 
 def test_a_walk_is_continuous_and_shows_every_kind_of_posture() -> None:
-    s = walking_session(4, 300)
+    s = walking_session(4, 450)
     speed = np.linalg.norm(np.diff(s.joints_arena, axis=0), axis=-1) * s.rate_hz
     assert speed.max() < 600.0
     assert np.linalg.norm(np.ptp(s.joints_arena[:, 0], axis=0)) > s.spine_mm

@@ -30,9 +30,7 @@ Array = NDArray[np.float64]
 STEP_S = 0.005  # of the animal's clock, independent of the camera's rate
 UNLABELLED = ""
 # channels of every animal: mm/s, rad/s, rad
-SPEED = 0
-TURN = 1
-CLIMB = 2
+SPEED, TURN, CLIMB = range(3)
 _TRIES = 16
 _TRAITS = {
     "vigour": 0.16,

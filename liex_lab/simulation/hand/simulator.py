@@ -46,7 +46,13 @@ from liex_lab.simulation._sensor_kernels import (
     PRIMESENSE_KIND,
 )
 from liex_lab.simulation.pose_prior import SIZE_RANGE
-from liex_lab.simulation.recording import OTHER_CAMERA, TrueRecording, planned, whole_images
+from liex_lab.simulation.recording import (
+    FRAME_NS,
+    OTHER_CAMERA,
+    TrueRecording,
+    planned,
+    whole_images,
+)
 from liex_lab.simulation.scene import PART_FACES, SPHERE_TUBE, rounded
 from liex_lab.simulation.species import KINECT_V2_SENSOR, Sensor, unseen
 from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, degrade
@@ -185,8 +191,6 @@ def _clipped(skeleton: Skeleton, angles: Array) -> Array:
 
 
 VARIABLE = "LIEX_NYU"
-FITTED = f"fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on"
-DRAWN = "drawn from statistics of one person's hand"
 _REPOSITORY = Path(__file__).resolve().parents[3]
 
 
@@ -496,8 +500,7 @@ def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, bod
     farthest = max(float(hand[..., 2].max()), float(np.quantile(body[..., 2], 0.9)))
     distance = np.minimum(farthest, 2000.0) + rng.uniform(150.0, 1500.0, m)
     slope = rng.normal(0.0, 0.25, (m, 2))
-    a = slope[:, 0] / intrinsics[:, 0] / distance
-    b = slope[:, 1] / intrinsics[:, 1] / distance
+    a, b = (slope[:, k] / intrinsics[:, k] / distance for k in range(2))
     c = 1.0 / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]
     wall = np.stack([a, b, c, rng.uniform(0.0, 6.0, m)], axis=1)
     wall[rng.random(m) < 0.2, :3] = 0.0
@@ -505,9 +508,6 @@ def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, bod
 
 
 NYU_SENSOR = Sensor("NYU Kinect", LABEL_CAMERA, PRIMESENSE_KIND)
-FRAME_NS = 33_333_333
-N_SESSIONS = 40
-N_FRAMES = 50
 # name: (own seed, shape family, noise, eroded pixels, share of frames with another object next to
 # the hand)
 SPLITS = {
@@ -622,7 +622,11 @@ class HandSimulator:
     @property
     def test_postures(self) -> str:
         """Source of the postures of the test splits, one phrase."""
-        return DRAWN if self.reference is None else FITTED
+        return (
+            "drawn from statistics of one person's hand"
+            if self.reference is None
+            else f"fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on"
+        )
 
     @property
     def sources(self) -> str:
@@ -689,7 +693,7 @@ class HandSimulator:
             )
 
     def test_split(
-        self, name: str, spine_mm: float | None = None, n_sessions: int = N_SESSIONS
+        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
     ) -> list[HandSession]:
         """The recordings of a split: 40 of 50 independent frames, each of another person.
 
@@ -710,7 +714,7 @@ class HandSimulator:
         for turn, kind, settings in planned(name, n_sessions, SPLITS, _SEALED_SEED):
             sensor = others[turn % len(others)] if kind == OTHER_CAMERA else NYU_SENSOR
             settings |= {"sensor": sensor, "spine_mm": spine_mm}
-            sessions.append(self._film(N_FRAMES, self._test_hands, **settings))
+            sessions.append(self._film(50, self._test_hands, **settings))
         return sessions
 
     def _film(

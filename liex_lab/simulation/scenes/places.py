@@ -267,29 +267,6 @@ _OUTLINE = 48  # corners of a round wall
 _LUMP_MM = 18.0
 
 
-def look_down(camera_mm: float, tilt_rad: float, toward_rad: float) -> SE3:
-    """Pose of a camera above a floor.
-
-    Args:
-        camera_mm: its height, mm.
-        tilt_rad: of its axis from the vertical, rad.
-        toward_rad: direction in the image that is tilted away from the floor, rad.
-
-    Returns:
-        T_arena_camera; the arena frame's origin is at the camera's foot, its x along the camera's.
-    """
-    up = -np.array(
-        [
-            np.sin(tilt_rad) * np.cos(toward_rad),
-            np.sin(tilt_rad) * np.sin(toward_rad),
-            np.cos(tilt_rad),
-        ]
-    )
-    x = np.array([1.0, 0.0, 0.0]) - up[0] * up
-    x /= np.linalg.norm(x)
-    return SE3(np.stack([x, np.cross(up, x), up]), np.array([0.0, 0.0, camera_mm]))
-
-
 def outline_of_walls(arena: SimulatedScene) -> Array:
     """The foot of an arena's walls: (n, 2) corners, counter-clockwise, mm."""
     if arena.kind == ROUND:

@@ -142,18 +142,17 @@ def timing_of(presence: str, n_frames: int) -> tuple[NDArray[np.int64], NDArray[
         Index of the moment of its walk in each frame (n,), and its presence (n,).
     """
     frame = np.arange(n_frames)
-    there = np.ones(n_frames, np.bool_)
-    if presence == "asleep":
-        falls, wakes = (int(share * n_frames) for share in (0.12, 0.90))
-        return np.where(frame < falls, frame, np.maximum(falls, frame - (wakes - falls))), there
-    if presence == "still":
-        return np.zeros(n_frames, np.int64), there
-    if presence == "late":
-        comes = int(2.0 / 3.0 * n_frames)
-        return np.maximum(frame - comes, 0), frame >= comes
-    if presence == "leaves":
-        return frame, frame < max(1, int(0.45 * n_frames))
-    return frame, there & (presence != "never")
+    always = np.ones(n_frames, np.bool_)
+    falls, wakes, comes = (int(share * n_frames) for share in (0.12, 0.90, 2.0 / 3.0))
+    slept = np.where(frame < falls, frame, np.maximum(falls, frame - (wakes - falls)))
+    return {
+        "always": (frame, always),
+        "asleep": (slept, always),
+        "still": (np.zeros(n_frames, np.int64), always),
+        "late": (np.maximum(frame - comes, 0), frame >= comes),
+        "leaves": (frame, frame < max(1, int(0.45 * n_frames))),
+        "never": (frame, ~always),
+    }[presence]
 
 
 def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
