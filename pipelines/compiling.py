@@ -38,8 +38,8 @@ def compile_ahead(*animals: str, progress: Progress = silent) -> bool:
 
     if n_cores() < 2 or numba.config.DISABLE_JIT or numba.config.BOUNDSCHECK:
         return False
-    marks = {animal: _mark(animal) for animal in animals if listed_kernels(animal)}
-    marks = {animal: mark for animal, mark in marks.items() if mark and not mark.is_file()}
+    found = {animal: _mark(animal) for animal in animals if listed_kernels(animal)}
+    marks = {animal: mark for animal, mark in found.items() if mark and not mark.is_file()}
     rows = {
         (row["kernel"], str(row["args"])): (f"{animal}:{number}", row["cpu_s"])
         for animal in marks
@@ -187,8 +187,9 @@ def _keep_callees_cheap() -> None:
     again. Here they get the first, cheaper optimisation only and no machine code. The kernel's own
     code is as fast as usual. In a process with this, kernels can be compiled but not called.
     """
-    from numba.core import caching, codegen, dispatcher
+    from numba.core import caching, codegen
 
+    dispatcher: Any = importlib.import_module("numba.core.dispatcher")  # its stubs are incomplete
     library, compiler = codegen.CPUCodeLibrary, dispatcher._FunctionCompiler
     compile_whole, save = compiler.compile, caching.Cache.save_overload
     optimize, finalize = library._optimize_final_module, library._finalize_final_module

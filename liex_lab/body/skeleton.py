@@ -228,7 +228,7 @@ class Skeleton:
             ),
             (not isinstance(surface, dict), f"{origin}: [surface] is a table, got {surface!r}"),
         )
-        rows = [_parsed_joint(joint, k, origin) for k, joint in enumerate(joints)]
+        rows = [_parsed_joint(joint, k, origin) for k, joint in enumerate(joints or [])]
         names, named_parents, offset, rest, free, limits_deg = zip(*rows, strict=True)
         refuse(
             LiexError,

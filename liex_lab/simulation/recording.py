@@ -170,22 +170,24 @@ class TrueRecording(Recording):
         """
         raise NotImplementedError
 
-    def chunks(self, n_frames: int, first: int = 0) -> Iterator[list[DepthFrame]]:
+    def chunks(
+        self, n_frames: int, first: int = 0, stop: int | None = None
+    ) -> Iterator[list[DepthFrame]]:
         """The frames in lists, each list rendered on all threads.
 
         Args:
             n_frames: frames per list; the last may be shorter.
             first: first frame.
+            stop: one past the last frame; None for all.
 
         Yields:
             Lists of depth frames in order of time.
         """
-        for start in range(first, len(self), n_frames):
-            stop = min(start + n_frames, len(self))
-            depths = self.depths(start, stop)
-            yield [
-                DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in range(start, stop)
-            ]
+        end = len(self) if stop is None else min(stop, len(self))
+        for start in range(first, end, n_frames):
+            rows = range(start, min(start + n_frames, end))
+            depths = self.depths(rows.start, rows.stop)
+            yield [DepthFrame(i, int(self.times_ns[i]), depths[i - start]) for i in rows]
 
 
 def whole_images(camera: Camera, n: int) -> render_kernels.PatchCamera:

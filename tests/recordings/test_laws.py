@@ -192,8 +192,8 @@ class Bounded(io.BufferedReader):
 
 
 # one of every kind; the others nightly
-QUICK = ("png", "tiff-stack", "moseq-dat", "moseq-archive", "azure-mkv", "oni-16zT", "ros2-db3")
-QUICK += ("mcap-foxglove", "bag-lz4")
+QUICK = ["png", "tiff-stack", "moseq-dat", "moseq-archive", "azure-mkv", "oni-16zT", "ros2-db3"]
+QUICK += ["mcap-foxglove", "bag-lz4"]
 
 
 @pytest.mark.parametrize(

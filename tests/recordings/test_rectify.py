@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from liex_lab.optics.camera import RANGINGS, Camera, Distortion, Water
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.rectify import (
     ideal_camera,
@@ -101,7 +102,12 @@ def test_it_is_lazy_and_sliceable() -> None:
     reads: list[int] = []
     original = recording(BARREL)
     read = original._read
-    original._read = lambda k: (reads.append(k), read(k))[1]
+
+    def count(k: int) -> DepthFrame:
+        reads.append(k)
+        return read(k)
+
+    original._read = count
     seen = rectified(original, WATER)
     assert reads == []
     part = seen[2:8:3]

@@ -112,6 +112,7 @@ def test_what_the_system_has_run_out_of_is_known(error: Exception | None, says: 
     assert says in why
     assert bool(says) == bool(why)
     if "memory" in why:
+        assert error is not None
         told = describe_failure(error, "measuring", None)
         assert told["reason"] == "the memory was not enough"
         assert "traceback" not in told

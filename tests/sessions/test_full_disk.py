@@ -91,7 +91,7 @@ def test_a_replay_whose_thread_is_dead_is_abandoned_within_seconds(
     writer = SessionWriter(tmp_path / "walk.liex", MOUSE.provenance())
     writer._replay._stream.disconnect()
     monkeypatch.setattr(writer._replay, "_stream", _Dead())
-    monkeypatch.setattr(replay.places, "probe_full", lambda _: FULL if full else None)
+    monkeypatch.setattr(replay.durable, "probe_full", lambda _: FULL if full else None)
     began = time.monotonic()
 
     def write() -> None:

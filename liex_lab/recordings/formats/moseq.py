@@ -398,7 +398,7 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
     known = (camera for word, camera in _CAMERA_WORDS.items() if word in plain)
     kind = next(known, OTHER if name else None)
-    return Metadata(size and tuple(size), dtype, kind, name, facts, problems)
+    return Metadata((size[0], size[1]) if size else None, dtype, kind, name, facts, problems)
 
 
 def read_session_stamps(

@@ -434,8 +434,11 @@ class FishActor:
                 "wave": rng.uniform(0.3, 0.8),
             }
         else:  # backing
-            pace = -vigour * rng.uniform(0.1, 0.5)
-            own |= {"speed": pace, "wave": rng.uniform(0.3, 1.0), "beat": 3.5}
+            own |= {
+                "speed": -vigour * rng.uniform(0.1, 0.5),
+                "wave": rng.uniform(0.3, 1.0),
+                "beat": 3.5,
+            }
         return self._channels(t, roll, **own)
 
 

@@ -659,7 +659,8 @@ class HandSimulator:
             degrade(rng, cameras[-1], degraded_share)
             shape = draw_hands(rng, skeleton, family, m)[each]
             size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
-            kind, intrinsics, size_px, parameters = (part[each] for part in cameras)
+            kind, size_px = cameras[0][each], cameras[2][each]
+            intrinsics, parameters = cameras[1][each], cameras[3][each]
             low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind]
             angles, turns = draw_wide(rng, skeleton, BLOCK)
             places = draw_places(rng, intrinsics, size_px.astype(float), low, high)

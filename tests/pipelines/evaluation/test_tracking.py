@@ -2,7 +2,6 @@
 picture of it.
 """
 
-from functools import partial
 from itertools import pairwise
 from unittest.mock import patch
 
@@ -15,7 +14,7 @@ from liex_lab.pipelines.evaluation.tracking import PAPER_ROWS, ROWS, _pattern_se
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.runtime.progress import silent
 from liex_lab.tracking import particles
-from liex_lab.tracking.particles import ParticleFilter, ProcessNoise
+from liex_lab.tracking.particles import ProcessNoise
 from tests.estimation.toy import trained
 
 
@@ -29,7 +28,6 @@ def test_the_smoothed_track_is_better_than_its_frames_and_the_paper_s_algorithms
         tracking, "estimator_of", lambda animal, variant, *_: paper if variant == "paper" else own
     )
     monkeypatch.setattr(tracking, "_AGAIN", 1)
-    monkeypatch.setattr(tracking, "ParticleFilter", partial(ParticleFilter, n_particles=20))
     figure = tmp_path / "figure.png"
     result = tracking.evaluate_tracking(
         "mouse", "hard", seed=21, n_frames=40, paper=True, figure=figure

@@ -486,8 +486,8 @@ def write_json(
     return write_messages(
         path,
         (
-            (f"/depth/{kind}", f"foxglove.{kind}", "json", *times, json.dumps(content).encode())
-            for kind, content, *times in written
+            (f"/depth/{kind}", f"foxglove.{kind}", "json", log, sent, json.dumps(content).encode())
+            for kind, content, log, sent in written
         ),
         chunk_size=1 << 20,
     )

@@ -4,6 +4,7 @@ import math
 import struct
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,7 +181,7 @@ def test_intrinsics_come_from_the_field_of_view(path: Path) -> None:
     ],
 )
 def test_intrinsics_of_old_files_come_from_the_lens_itself(
-    path: Path, width: int, stated: dict[str, bytes]
+    path: Path, width: int, stated: dict[str, Any]
 ) -> None:
     with open_recording(lens_file(path, size=(width, width * 3 // 4), **stated)) as recording:
         camera = recording.camera
