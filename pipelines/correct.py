@@ -188,10 +188,10 @@ def _describe(raw: Session, log: corrections.Log, folder: Path) -> corrections.L
 def _summary(log: corrections.Log) -> dict[str, Any]:
     """Summary of the active corrections for session.json: numbers by kind, authors, last time."""
     made = [(entry.what, entry.author) for entry in log.touched if entry.what is not None]
-    kinds = {kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")}
+
     return {
         "n": len(made),
-        **kinds,
+        **{kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")},
         "authors": sorted({author for _, author in made}),
         "last": log.touched[-1].made_at,
     }

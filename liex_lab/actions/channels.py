@@ -350,6 +350,8 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
     Returns:
         (m, F) float32.
     """
+    from scipy.ndimage import maximum_filter1d
+
     x = segment.values
     step = segment.times_s[1] - segment.times_s[0]
     signed = np.array([name.endswith("~") for name in names])
@@ -364,7 +366,8 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
         mean, square = (_window_mean(total, start, stop, step) for total in (sums, squares))
         level = np.where(signed, np.abs(mean), mean)
         parts += [level.astype(np.float32), np.sqrt(np.maximum(square, 0.0)).astype(np.float32)]
-    parts.append(_extreme(np.abs(x), 0.25, step))
+    width = 2 * max(1, round(0.25 / step)) + 1
+    parts.append(maximum_filter1d(np.abs(x), width, axis=0, mode="nearest"))
     return np.concatenate(parts, axis=1, dtype=np.float32)
 
 
@@ -377,12 +380,3 @@ def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Ar
     low = np.clip(rows + round(start_s / step), 0, m - 1)
     high = np.clip(rows + round(stop_s / step), 0, m - 1) + 1
     return np.asarray((total[high] - total[low]) / (high - low)[:, None])
-
-
-def _extreme(x: Array, half_s: float, step: float) -> Array:
-    """The maximum (m, C) within half_s of each tick."""
-    from scipy.ndimage import maximum_filter1d
-
-    return np.asarray(
-        maximum_filter1d(x, 2 * max(1, round(half_s / step)) + 1, axis=0, mode="nearest")
-    )

@@ -79,14 +79,13 @@ def learn(
     networks = tuple(train_network(examples, len(words), seed + k) for k in range(2))
     share = np.bincount(examples.code, minlength=len(words)) / len(examples.code)
     speeds, peaks = speeds_of(examples, len(words))
-    chain = SemiMarkovModel.learn(examples.runs[: len(tracks)], len(words))
     return TimelineModel(
         skeleton,
         clock_hz,
         words,
         share,
         networks,
-        chain,
+        SemiMarkovModel.learn(examples.runs[: len(tracks)], len(words)),
         0.1,
         speeds,
         peaks,

@@ -342,6 +342,5 @@ def action_colours(words: Sequence[str]) -> dict[str, str]:
     for word in words:
         if _OWN.get(word, "") not in {"", *chosen.values()}:
             chosen[word] = _OWN[word]
-    free = [colour for colour in PALETTE if colour not in chosen.values()]
-    left = cycle(free or PALETTE)
+    left = cycle([colour for colour in PALETTE if colour not in chosen.values()] or PALETTE)
     return {word: chosen.get(word) or next(left) for word in words}

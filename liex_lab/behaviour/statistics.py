@@ -192,13 +192,16 @@ def _whole_cages(
     animals: pd.DataFrame, second: NDArray[np.bool_], block: NDArray[np.int64]
 ) -> Units:
     """One value per cage, the mean of its animals' values."""
-    table = animals.assign(second=second, block=block)
-    cages = table.groupby("cage", sort=True).agg(
-        value=("value", "mean"),
-        second=("second", "first"),
-        block=("block", "first"),
-        n=("value", "size"),
-        blocks=("block", "nunique"),
+    cages = (
+        animals.assign(second=second, block=block)
+        .groupby("cage", sort=True)
+        .agg(
+            value=("value", "mean"),
+            second=("second", "first"),
+            block=("block", "first"),
+            n=("value", "size"),
+            blocks=("block", "nunique"),
+        )
     )
     _require(
         bool((cages["blocks"] == 1).all()),

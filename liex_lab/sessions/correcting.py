@@ -285,8 +285,7 @@ def joint_move_at_pixel(
             f"the line of sight of pixel ({u_px:g}, {v_px:g}) does not reach the height of the "
             f"{joint}; choose a pixel nearer to the animal, or give the place in mm"
         )
-    note = OFF_THE_ANIMAL if off else ""
-    return joint_move(session, frame, joint, eye + depth_mm * along, note)
+    return joint_move(session, frame, joint, eye + depth_mm * along, OFF_THE_ANIMAL if off else "")
 
 
 def _skin_under(

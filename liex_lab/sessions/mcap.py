@@ -417,8 +417,7 @@ class McapWriter:
     def _log_track(self, track: Track) -> None:
         """Skeleton and transforms of some frames."""
         posed = track.posed
-        rotations = np.where(posed[:, None, None], track.root_rotation, np.eye(3))
-        quaternions = so3.quaternion(rotations)
+        quaternions = so3.quaternion(np.where(posed[:, None, None], track.root_rotation, np.eye(3)))
         for i, time_ns in enumerate(track.times_ns.tolist()):
             joints_m = track.joints_mm[i] / 1000.0
             found = bool(posed[i])
@@ -489,12 +488,12 @@ class McapWriter:
             )
             return messages.SceneUpdate(deletions=[gone])
         points = [messages.Point3(x=x, y=y, z=z) for x, y, z in joints_m.tolist()]
-        ends = [points[end] for edge in self._origin.skeleton.edges for end in edge]
+
         lines = messages.LinePrimitive(
             type=messages.LinePrimitiveLineType.LineList,
             pose=_place(0.0, 0.0, 0.0),
             thickness=0.7 * self._dot_m,
-            points=ends,
+            points=[points[end] for edge in self._origin.skeleton.edges for end in edge],
             color=_BONE,
         )
         across = 2.0 * self._dot_m
@@ -518,11 +517,11 @@ class McapWriter:
         if not found:
             return messages.ImageAnnotations(points=[])
         at = [messages.Point2(x=u, y=v) for u, v in uv.tolist()]
-        ends = [at[end] for edge in self._origin.skeleton.edges for end in edge]
+
         lines = messages.PointsAnnotation(
             timestamp=_stamp(time_ns),
             type=messages.PointsAnnotationType.LineList,
-            points=ends,
+            points=[at[end] for edge in self._origin.skeleton.edges for end in edge],
             outline_color=_JOINT,
             thickness=1.5,
         )

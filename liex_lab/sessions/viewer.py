@@ -143,10 +143,10 @@ def _begin(*arguments: str, stays: bool = False) -> tuple[int, subprocess.Popen[
         probe.bind(("127.0.0.1", 0))
         port = int(probe.getsockname()[1])
     given = ("--port", str(port), "--hide-welcome-screen", "--bind", "127.0.0.1")
-    command = own_python("-m", "rerun", *given, *arguments)
+
     # RERUN_ANALYTICS: no telemetry from a laboratory's data
     viewer = subprocess.Popen(
-        command,
+        own_python("-m", "rerun", *given, *arguments),
         env={**os.environ, "RERUN_ANALYTICS": "0"},
         start_new_session=True,
         stdin=subprocess.DEVNULL,

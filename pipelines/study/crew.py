@@ -80,7 +80,7 @@ def measure_one(
             raise RecordingError(
                 f"there is no recording {session.recording}; correct its path, or copy it there"
             )
-        problems = {"problems": [session.remark]} if session.remark else {}
+
         run(
             session.recording,
             session.plan,
@@ -89,7 +89,7 @@ def measure_one(
             notes={
                 "input": {"stamp": input_stamp(session.recording)},
                 "run_id": run_id,
-                **problems,
+                **({"problems": [session.remark]} if session.remark else {}),
             },
             pool=pool,
             progress=stage,
@@ -173,8 +173,7 @@ class Crew:
             finished: called with each result as it arrives.
         """
         shared = n_shared(len(todo), self._n_jobs or len(self.client.nthreads()))
-        run_id = f"{os.getpid()}-{time.monotonic_ns()}"
-        task = partial(measure_one, run=run, run_id=run_id)
+        task = partial(measure_one, run=run, run_id=f"{os.getpid()}-{time.monotonic_ns()}")
         planned = [one.session for one in todo]
         return self._each(planned, task, "measuring", quarantine, report, finished, shared)
 

@@ -255,19 +255,6 @@ def test_best_path_and_probabilities_agree_with_every_path(seed: int) -> None:
     np.testing.assert_allclose(chain.probabilities(scores, 1.0), expected, atol=1e-5)
 
 
-def test_no_action_is_shorter_than_its_shortest_but_at_the_ends() -> None:
-    rng = np.random.default_rng(1)
-    chain = SemiMarkovModel(
-        np.array([0.1, 0.5]), np.array([0.6, 0.9]), np.array([[0.0, 1.0], [1.0, 0.0]])
-    )
-    label = chain.decode(rng.normal(0.0, 2.0, (2000, 2)), 0.05)
-    edges = np.flatnonzero(np.diff(label)) + 1
-    lengths = np.diff(edges)
-    kinds = label[edges[:-1]]
-    assert lengths[kinds == 1].min() >= 10
-    assert lengths[kinds == 0].min() >= 2
-
-
 def test_durations_and_successions_are_learned_from_bouts() -> None:
     chain = SemiMarkovModel.learn([[(0, 1.0), (1, 2.0), (0, 1.2), (1, 2.2)]], 3)
     assert chain.mean_s[:2] == pytest.approx([1.1, 2.1])

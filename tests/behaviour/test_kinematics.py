@@ -62,14 +62,6 @@ def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, mo
         pd.testing.assert_frame_equal(of_track, in_memory, check_exact=True)
 
 
-def test_a_dropped_frame_and_an_uneven_clock_leave_the_speed_as_it_is():
-    rng = np.random.default_rng(5)
-    times = steady(4.0) + rng.uniform(-0.004, 0.004, 120)
-    times = np.delete(times - times[0], [30, 50, 51, 52, 53, 54, 90])
-    moved = kinematics(*tables_of(WalkingMouse(times, speed_mm_s=180.0, radius_mm=200.0)))
-    np.testing.assert_allclose(moved["speed_mm_s"], 180.0, rtol=1e-3)
-
-
 def test_no_difference_is_taken_across_a_gap():
     """Between two stretches the animal was carried to another place: nobody walked that far."""
     mouse = WalkingMouse(np.delete(steady(2.0), slice(30, 40)), speed_mm_s=100.0)

@@ -8,10 +8,8 @@ import pandas as pd
 import pytest
 from liex_lab.pipelines.evaluation.statistics import PLANS, StudyPlan, error_rates, power
 
-from liex_lab.behaviour import measure_session
 from liex_lab.behaviour.cohort import (
     STATS,
-    collect,
     compare,
     counted_units,
     methods,
@@ -30,7 +28,6 @@ from liex_lab.behaviour.statistics import (
     permutation,
     smallest_p,
 )
-from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 RNG = np.random.default_rng(0)
 
@@ -324,22 +321,6 @@ def test_a_strange_table_is_refused_row_by_row_and_does_not_break():
     assert len(compare(pd.DataFrame({"group": []}), ["speed"])) == 0
     with pytest.raises(NotComparable):
         find_units(study(1).assign(value=[1.0, 2.0]), ("a", "b"))
-
-
-def test_sessions_are_collected_with_who_they_are_of(tmp_path):
-    sessions = []
-    for k in range(2):
-        subject = {"subject_id": f"m{k}", "group": "ab"[k], "cage": "c1"}
-        sessions.append(
-            write(tmp_path / f"{k}.liex", WalkingMouse(steady(1.0)), name=f"s{k}", subject=subject)
-        )
-    table = collect(sessions)
-    assert list(table["subject_id"]) == ["m0", "m1"]
-    assert table["distance_m"].iloc[0] == pytest.approx(
-        measure_session(sessions[0]).summary["distance_m"].iloc[0]
-    )
-    assert (table["n_bouts"] > 0).all()
-    assert "observed_s" in table
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from liex_lab.behaviour import ACTIONS, Surroundings, measure, measure_session
+from liex_lab.behaviour import Surroundings, measure, measure_session
 from liex_lab.behaviour.activity import (
     _binomial,
     activity,
@@ -237,21 +237,6 @@ def test_a_mouse_along_the_wall_is_in_the_outer_half():
     row = measure(frames, poses, around=Surroundings(bowl)).summary.iloc[0]
     assert (row["wall_distance_mm"], row["outer_half_share"]) == (30.0, 1.0)
     assert np.isnan(measure(frames, poses).summary["outer_half_share"].iloc[0])
-
-
-def test_activity_adds_up_to_the_session():
-    frames, poses = tables_of(
-        WalkingMouse(steady(30.0), rear_s=(5.0, 8.0), lost=tuple(range(300, 360)))
-    )
-    behaviour = measure(frames, poses)
-    table, row = behaviour.activity, behaviour.summary.iloc[0]
-    assert len(table) == 10
-    assert table["observed_s"].sum() == pytest.approx(row["observed_s"])
-    assert table["distance_mm"].sum() == pytest.approx(1000 * row["distance_m"])
-    for word in ACTIONS:
-        assert table[f"{word}_s"].sum() == pytest.approx(row[f"{word}_s"])
-    assert table["rear_s"].iloc[1] == pytest.approx(0.95, abs=0.05)
-    assert table["rear_s"].iloc[2] == pytest.approx(1.95, abs=0.05)
 
 
 def test_long_sessions_are_cut_into_minutes():

@@ -201,7 +201,7 @@ def test_a_region_in_millimetres_on_the_floor_is_the_one_in_the_picture(tmp_path
     assert Plan.from_toml(plan.to_toml()) == plan
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_doctor_proposes_several_arenas_and_says_what_to_run_next():
     found = examine(
         "synthetic:scene?name=two-arenas&seed=1001&frames=40", propose=True, named=False

@@ -444,6 +444,7 @@ def test_an_archive_is_not_packed_again(walking: Path) -> None:
         pack(done.path, walking.with_name("again.mcap"), plan=PLAN)
 
 
+@pytest.mark.nightly
 def test_a_run_on_an_archive_gives_the_same_tables(
     walk: Path, walked: Session, tmp_path: Path
 ) -> None:

@@ -118,6 +118,7 @@ def test_every_format_stays_in_its_folder(
         assert export(session, to, out, overwrite=True).parent == out
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", _SOME)
 def test_sessions_reports_corrections_and_comparisons_stay_in_theirs(name: str, root: Path) -> None:
     out = root / "a" / "b" / "out"

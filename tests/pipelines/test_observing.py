@@ -97,6 +97,7 @@ def test_who_stops_early_waits_for_no_more_than_what_is_under_way() -> None:
     assert tracker.at_once == 0
 
 
+@pytest.mark.nightly
 def test_observations_are_those_of_one_stretch_after_the_other_bit_for_bit() -> None:
     filmed = world_of(Skeleton.load("mouse")).motion(5, 40)
     frames = list(filmed)

@@ -146,6 +146,7 @@ def test_an_older_session_is_replaced_only_on_demand_and_that_is_refused_at_once
         measure(walk, MOUSE, walked.path.parent)
 
 
+@pytest.mark.nightly
 def test_a_recording_without_an_animal_is_refused_and_leaves_nothing(mouse, tmp_path):
     rng = np.random.default_rng(1)
     bare = mouse.floor.depth(mouse.width, mouse.height) + rng.normal(
@@ -158,6 +159,7 @@ def test_a_recording_without_an_animal_is_refused_and_leaves_nothing(mouse, tmp_
     assert not list((tmp_path / "out").glob("*"))
 
 
+@pytest.mark.nightly
 def test_zones_are_drawn_in_a_file_that_the_plan_names(walk, walked, tmp_path):
     """Left and right of the arena's middle: every frame is in one of them, and together they take
     all the time.

@@ -173,12 +173,6 @@ def test_all_is_on_disk_before_an_older_session_or_older_corrections_go(place: P
     check_order(calls, place / "corrected")
 
 
-def test_a_first_session_is_on_disk_too(tmp_path: Path) -> None:
-    with recorded() as calls:
-        write(tmp_path / "first.liex", MOUSE)
-    check_order(calls, tmp_path / "first.liex")
-
-
 def test_corrections_that_cannot_be_read_are_kept_and_not_taken_over(place: Path) -> None:
     (place / "corrected" / "corrections.json").write_text("")
     set_outdated(place)

@@ -108,9 +108,7 @@ def test_its_logs_are_whole_and_hold_every_frame_once(
         expected = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
     for topic in {*found, *expected} - {"/camera/calibration", "/tf"}:  # repeated by each run
         assert found[topic] == expected[topic], topic
-    n_messages = found.total()
-    assert summary.statistics.message_count == n_messages
-    assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+    assert summary.statistics.message_count == found.total()
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # what was joined is read as a whole

@@ -11,11 +11,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 import liex_lab.sessions.rrd_scene as depth_of
 from liex_lab.body.pose import Pose
-from liex_lab.errors import RecordingError, SessionError
+from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.recordings.depth_kernels import to_millimetres, unpack_rvl
 from liex_lab.recordings.frame import region_mask
@@ -129,34 +128,6 @@ def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
             n_unread += int((held[inside] == 0).sum())
             assert inside.all() == (row == UNSEEN), "where nothing was found it is kept whole"
     assert n_unread > 0, "unread pixels stay unread"
-
-
-def test_of_a_damaged_replay_no_image_is_taken_for_another_one(
-    whole: Session, tmp_path: Path
-) -> None:
-    damaged = Session.open(shutil.copytree(whole.path, tmp_path / "damaged.liex"))
-    path = damaged.path / "session.mcap"
-    with open_depth(whole) as images:
-        before = [images.frame(row).depth for row in range(len(images))]
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    bad = summary.chunk_indexes[1]
-    content = bytearray(path.read_bytes())
-    for at in range(bad.chunk_start_offset + 80, bad.chunk_start_offset + 400):
-        content[at] ^= 0xFF
-    path.write_bytes(content)
-    n_refused = 0
-    with open_depth(damaged) as pictures:
-        assert len(pictures) == len(before)
-        for row, depth in enumerate(before):
-            if bad.message_start_time <= pictures.times_ns[row] <= bad.message_end_time:
-                n_refused += 1
-                with pytest.raises(RecordingError, match="is damaged"):
-                    pictures.frame(row)
-            else:
-                np.testing.assert_array_equal(pictures.frame(row).depth, depth)
-    assert 0 < n_refused < len(before)
 
 
 def test_in_the_replay_a_cut_out_is_seen_by_a_camera_of_its_own(session: Session) -> None:
@@ -283,18 +254,6 @@ def test_without_depth_neither_replay_holds_any_and_it_is_said_why(tmp_path: Pat
         open_depth(session)
     with pytest.raises(SessionError, match="keeps no depth images"):
         correcting.joint_move_at_pixel(session, 3, "neck", 40.0, 30.0)
-
-
-def test_a_joint_cannot_be_put_where_the_still_scene_is_shown(session: Session) -> None:
-    boxes = Kept(session).boxes
-    assert boxes is not None
-    left, top, right, bottom = boxes[3, 0]
-    u, v = (0, 0) if left > 0 or top > 0 else (right, bottom)
-    with pytest.raises(SessionError, match="for the animal is 90 mm long"):
-        correcting.joint_move_at_pixel(session, 3, "neck", float(u), float(v))
-    uv = MOUSE.track().uv_px[3, 1]
-    moved = correcting.joint_move_at_pixel(session, 3, MOUSE.skeleton.names[1], *uv)
-    assert moved.frame == 3
 
 
 def test_damaged_boxes_are_told_in_a_sentence(session: Session, tmp_path: Path) -> None:

@@ -71,6 +71,7 @@ def test_corrections_follow_a_session_through_every_failure(session: PlannedSess
     assert measure_one(session, run)["corrections_taken_from"] == ""
 
 
+@pytest.mark.nightly
 def test_an_outdated_copy_with_corrections_of_its_own_is_never_removed(
     session: PlannedSession,
 ) -> None:
@@ -90,16 +91,3 @@ def test_an_outdated_copy_with_corrections_of_its_own_is_never_removed(
     fails(session)
     assert copies(session) == ["behav.outdated", "behav.outdated-2"]
     assert str(read_log(outdated.with_name("behav.outdated-2")).entries[0].what).startswith("groom")
-
-
-def test_what_an_older_version_left_behind_is_taken_over(session: PlannedSession) -> None:
-    """It renamed the session with its corrections, and the next one did not look there."""
-    folder = session.folder
-    folder.rename(folder.with_name("behav.outdated"))
-    (folder.with_name("behav.outdated") / "corrected").rename(folder.with_name("corrected"))
-    measure_one(session, run)
-    assert "groom" not in words(session)
-    folder.with_name("corrected").rename(folder.with_name("behav.outdated") / "corrected")
-    told = measure_one(session, run)
-    assert told["corrections_taken_from"] == "behav.outdated"
-    assert "groom" in words(session)
