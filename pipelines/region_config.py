@@ -289,7 +289,7 @@ class StatedRegions:
         file = session.path.with_name(f"{session.path.stem}.plan.toml")
         stated = None
         with suppress(ValueError):
-            stated = _at(
+            stated = text_files.value_at(
                 _table(file) if file.is_file() else text_files.parse_toml(session.plan), _REGION
             )
         return [Place("beside", "this recording, in a plan beside it", file, _REGION, stated)]
@@ -342,32 +342,35 @@ class StatedRegions:
 
 
 def _of_study(k: int, planned: PlannedSession, study: Study) -> list[Place]:
-    table = study.table
+    table, at = study.table, text_files.value_at
     one = table.sessions[k]
     named = one.plan or table.plan
-    arenas = [arena.name for arena in table.arenas]
-    places = []
+    where: tuple[str, Path, Keys, Any] = (
+        "every recording of the study",
+        study.path,
+        ("set", *_REGION),
+        at(table.set, _REGION),
+    )
     if one.arena:
-        j = arenas.index(one.arena)
-        stated = table.arenas[j].region.model_dump(exclude_none=True)
-        title = f"every recording in the arena {one.arena}"
-        places.append(Place("arena", title, study.path, ("arenas", j, "region"), stated))
-    elif named in known_plans() or _at(table.set, _REGION) is not None:
-        path: tuple[str | int, ...] = ("set", *_REGION)
-        title = "every recording of the study"
-        places.append(Place("all", title, study.path, path, _at(table.set, _REGION)))
-    else:
+        j = [arena.name for arena in table.arenas].index(one.arena)
+        where = (
+            f"every recording in the arena {one.arena}",
+            study.path,
+            ("arenas", j, "region"),
+            table.arenas[j].region.model_dump(exclude_none=True),
+        )
+    elif named not in known_plans() and where[-1] is None:
         file = study.inside(named, "plan")
         title = f"every recording that is measured by {file.name}"
-        places.append(Place("all", title, file, _REGION, _at(_table(file), _REGION)))
-    stated = _at(planned.animal.set, _REGION)
+        where = title, file, _REGION, at(_table(file), _REGION)
+    places = [Place("arena" if one.arena else "all", *where)]
+    stated = at(planned.animal.set, _REGION)
     if stated is not None:
-        m = table.animals.index(planned.animal)
+        of_animal = ("animals", table.animals.index(planned.animal), "set", *_REGION)
         title = f"every recording of {planned.animal.id}"
-        places.append(Place("animal", title, study.path, ("animals", m, "set", *_REGION), stated))
+        places.append(Place("animal", title, study.path, of_animal, stated))
     own = ("sessions", k, "set", *_REGION)
-    places.append(Place("recording", "this recording", study.path, own, _at(one.set, _REGION)))
-    return places
+    return [*places, Place("recording", "this recording", study.path, own, at(one.set, _REGION))]
 
 
 def _region(stated: Any) -> sections.Region:
@@ -384,12 +387,6 @@ def _region(stated: Any) -> sections.Region:
 
 def _plain(corners: Any) -> list[list[float]]:
     return [[round(float(u), 1), round(float(v), 1)] for u, v in corners if math.isfinite(u + v)]
-
-
-def _at(table: Any, path: Sequence[str]) -> Any:
-    for part in path:
-        table = table.get(part) if isinstance(table, dict) else None
-    return table
 
 
 def _table(file: Path) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.runtime.text_files import value_at
 from liex_lab.sessions import Session, checkpoint, corrections
 
 from .session import run_session
@@ -84,7 +85,9 @@ def verify_session(
 
 def _provenance(session: Session) -> Iterator[Finding]:
     """Whether session.json has all that is needed to reproduce the session."""
-    missing = [name for name in _NEEDED if _at(session.metadata, name) in (None, "", {})]
+    missing = [
+        name for name in _NEEDED if value_at(session.metadata, name.split(".")) in (None, "", {})
+    ]
     if missing:
         yield Finding(
             "note",
@@ -158,7 +161,7 @@ def _logs(session: Session) -> Iterator[Finding]:
         yield Finding("wrong", str(error))
         return
     wanted = session.metadata.get("frames", {}).get("n_frames")
-    if n_depth == 0 and _at(session.metadata, "plan.replay.depth") == "none":
+    if n_depth == 0 and value_at(session.metadata, ("plan", "replay", "depth")) == "none":
         yield Finding("ok", f"session.rrd ({n} messages) is whole; no depth was to be kept")
     elif n_depth != wanted:
         yield Finding(
@@ -196,12 +199,13 @@ def _model(session: Session) -> Iterator[Finding]:
     except LiexError as error:
         yield Finding("note", f"its model is not here: {error}")
         return
-    if same:
-        yield Finding("ok", "its model is the one that is installed")
-        return
-    yield Finding(
-        "note",
-        f"it was made with another model {stated.get('name')} than the one that is installed",
+    yield (
+        Finding("ok", "its model is the one that is installed")
+        if same
+        else Finding(
+            "note",
+            f"it was made with another model {stated.get('name')} than the one that is installed",
+        )
     )
 
 
@@ -209,7 +213,7 @@ def _again(session: Session, recording: str, progress: Progress) -> Iterator[Fin
     """Measure the recording again and compare the tables."""
     plan = Plan.from_toml(session.plan, "plan.toml")
     with open_recording(recording, fps=plan.recording.fps, topic=plan.recording.topic) as opened:
-        if opened.digest(progress) != _at(session.metadata, "input.sha256"):
+        if opened.digest(progress) != session.metadata["input"].get("sha256"):
             yield Finding("wrong", f"{recording} is not the recording that the session was made of")
             return
     with tempfile.TemporaryDirectory(prefix="liex-verify-") as scratch:
@@ -243,10 +247,3 @@ def _same_rows(path: Path, other: Path) -> bool:
         return True
     # `equals` treats empty cells as equal
     return path.suffix == ".parquet" and pd.read_parquet(path).equals(pd.read_parquet(other))
-
-
-def _at(document: dict[str, Any], dotted: str) -> Any:
-    value: Any = document
-    for key in dotted.split("."):
-        value = value.get(key) if isinstance(value, dict) else None
-    return value

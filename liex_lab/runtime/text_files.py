@@ -290,3 +290,10 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def value_at(table: Any, path: Sequence[str]) -> Any:
+    """The value at a path of keys in nested tables; None where there is none."""
+    for part in path:
+        table = table.get(part) if isinstance(table, dict) else None
+    return table

@@ -261,14 +261,6 @@ class Columns:
                 self._files[name] = (self._folder / f"{name}.bin").open("ab")
             self._files[name].write(np.ascontiguousarray(values).tobytes())
 
-    def __len__(self) -> int:
-        """Rows so far."""
-        self.flush()
-        for name, (kind, shape) in self._kinds.items():
-            row = np.dtype(kind).itemsize * int(np.prod(shape))
-            return (self._folder / f"{name}.bin").stat().st_size // row
-        return 0
-
     def flush(self) -> None:
         """Pass everything written so far to the operating system."""
         for file in self._files.values():

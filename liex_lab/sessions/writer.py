@@ -222,8 +222,8 @@ class SessionWriter:
         self._times_ns.extend(times)
         if observations is not None:
             self._checkpoint.columns.append(observation_rows(frames, observations, boxes))
-        if self._checkpoint.due:
-            self._save_checkpoint()
+            if self._checkpoint.due:
+                self._save_checkpoint()
         self._seconds += time.perf_counter() - began
 
     def observations(self, kind: Callable[..., Kept]) -> Kept:
@@ -251,9 +251,8 @@ class SessionWriter:
         """Save a checkpoint of everything so far. Only frames with observations can resume."""
         self._drain()
         sizes = self._replay.flushed(), self._mcap.flushed()
-        if len(self._checkpoint.columns) == len(self._index):
-            seconds = round(self._checkpoint.seconds_before + self._elapsed, 3)
-            self._checkpoint.save(len(self._index), seconds, *sizes)
+        seconds = round(self._checkpoint.seconds_before + self._elapsed, 3)
+        self._checkpoint.save(len(self._index), seconds, *sizes)
 
     @property
     def allocate(self) -> memory.Allocator:

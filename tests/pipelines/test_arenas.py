@@ -103,7 +103,7 @@ def alone(session: Path, scene: str, out: Path, masked: bool) -> Path:
     return measure(cut, plan, out / str(masked))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_arena_is_the_session_of_the_same_arena_cut_out_and_run_alone(sessions, tmp_path):
     assert tables(alone(sessions[0][1], "two-arenas", tmp_path, True)) == tables(sessions[0][1])
     assert set(Counter(sessions[1]).values()) == {1}, "each frame is decoded once"

@@ -104,6 +104,7 @@ def test_gaps_are_kept(walked):
     assert walked.frames["gap_before"].sum() == 3
 
 
+@pytest.mark.nightly
 def test_tables_depend_neither_on_frames_in_memory_nor_on_who_opens_the_recording(
     walked, mouse, images, tmp_path, monkeypatch
 ):

@@ -218,7 +218,7 @@ def test_columns_grow_and_are_cut_back(tmp_path: Path) -> None:
     columns = Columns(tmp_path)
     for block in blocks:
         columns.append(block)
-    assert len(columns) == 9
+
     for name, values in columns.read().items():
         np.testing.assert_array_equal(values, np.concatenate([block[name] for block in blocks]))
     columns.close()
@@ -226,7 +226,7 @@ def test_columns_grow_and_are_cut_back(tmp_path: Path) -> None:
     assert not Columns.cut(tmp_path, 5)
     again = Columns(tmp_path)
     again.append(blocks[2])
-    assert len(again) == 5
+    assert len(again.read()["a"]) == 5
     with pytest.raises(ValueError, match="appended"):
         again.append({"a": np.zeros(1)})
     again.close()

@@ -19,6 +19,7 @@ from liex_lab.errors import StudyError
 _PAGES = ("/", "/json/identity.json", "/info/main/workers.html", "/health", "/metrics", "/status")
 
 
+@pytest.mark.nightly
 def test_its_pages_tell_other_accounts_of_this_machine_nothing() -> None:
     with cluster.crew_of(1) as crew:
         about: dict[str, Any] = crew.client.scheduler_info()
