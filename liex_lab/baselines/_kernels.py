@@ -66,14 +66,14 @@ def animal_points(heights, packed_camera, phase, points):
     for h in heights.flat:
         total += h > 0
     n = points.shape[0]
-    seen = 0
+    passed = 0
     k = 0
     for row in range(heights.shape[0]):
         for column in range(heights.shape[1]):
             h = heights[row, column]
             if h <= 0:
                 continue
-            while k < n and int((k + phase) * total / n) == seen:
+            while k < n and int((k + phase) * total / n) == passed:
                 z = camera.distance - h / 16.0
                 x = (camera.u0 + camera.step * column - camera.cx) / camera.fx * z
                 y = (camera.v0 + camera.step * row - camera.cy) / camera.fy * z
@@ -82,7 +82,7 @@ def animal_points(heights, packed_camera, phase, points):
                 points[k, 2] = camera.r20 * x + camera.r21 * y + camera.r22 * z
                 points[k, 2] += camera.distance
                 k += 1
-            seen += 1
+            passed += 1
 
 
 @kernel(nogil=True)

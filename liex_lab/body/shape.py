@@ -619,7 +619,7 @@ class Surface:
 
     @property
     def area_mm2(self) -> float:
-        """Approximate area of the home pose seen from above, mm^2 at scale 1.
+        """Approximate area of the home pose in top view, mm^2 at scale 1.
 
         Of capsules: their horizontal lengths times the sum of their radii at the ends; of a tube:
         its width integrated along the spine; of a mesh: its silhouette.

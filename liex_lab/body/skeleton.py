@@ -53,7 +53,7 @@ class CameraView:
             an animal that swims (otherwise the height map would reveal the size used to cut it), at
             home size for a hand.
         smooth_mm: readings within this distance, at home size, are averaged.
-        area: the smallest and the largest area seen from above, of the squared length.
+        area: the smallest and the largest area in top view, of the squared length.
         min_height_mm: smaller heights above the background are not the animal.
         foreground: 'background', the animal is segmented from a still scene, or 'nearest', nothing
             is nearer to the camera.
@@ -142,7 +142,7 @@ MOUSE_VIEW = CameraView()
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Kinematic tree of J joints: a straight home pose, seen from above, base at the origin.
+    """Kinematic tree of J joints: a straight home pose in top view, base at the origin.
 
     Frame of every joint: x forward (towards the head), y left, z up. The base joint, 0, has all six
     degrees of freedom. Parents precede their children.

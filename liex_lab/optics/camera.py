@@ -154,7 +154,7 @@ class Distortion:
         )
 
     def undistort(self, xy: ArrayLike) -> Array:
-        """The ideal rays of distorted ones; NaN if there is none within `limit`.
+        """The ideal rays of distorted ones; NaN without one within `limit`.
 
         The radius by bisection of the radial part, which increases, then Newton's steps for the
         small tangential one.

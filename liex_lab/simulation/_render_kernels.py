@@ -225,8 +225,10 @@ def _expose(
                 depth,
                 what,
             )
-    for r in range(depth.shape[0]):
-        for c in range(depth.shape[1]):
+    rows, columns = depth.shape
+    inside = u0 >= 0 and v0 >= 0 and u0 + columns <= size[0] and v0 + rows <= size[1]
+    for r in range(0 if inside else rows):
+        for c in range(columns):
             if u0 + c < 0 or v0 + r < 0 or u0 + c >= size[0] or v0 + r >= size[1]:
                 depth[r, c] = 0.0
                 what[r, c] = NOTHING if forget else what[r, c]

@@ -309,7 +309,7 @@ class Loss:
 
         Args:
             depths: (k, H, W) float32 mm, the frames from `first` on; changed.
-            still: (H, W) float32 mm, the still scene; None if there is none.
+            still: (H, W) float32 mm, the still scene; None without one.
             first: number of the first frame.
             seeds: (n,) uint64 of all frames, for the dropout's pattern.
             middle_px: (n, 2) the animal's centre in the image, px.

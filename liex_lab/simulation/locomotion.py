@@ -102,9 +102,7 @@ def moving_session(
     """
     rng = np.random.default_rng(seed)
     sensor = sensor or species.sensors[-1]
-    if spine_mm is None:
-        spine_mm = species.skeleton.length * float(rng.uniform(*species.sizes))
-    length = float(spine_mm)
+    length = float(spine_mm or species.skeleton.length * rng.uniform(*species.sizes))
     scene = SimulatedScene.draw(rng, sensor.camera, length, species.setting)
     shape = species.shapes(rng, family, 1)
     moves: dict[type[Species], tuple[str, Callable[..., tuple[Pose, Array]]]] = {

@@ -352,8 +352,7 @@ def render_agent(
     n = len(girth)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     bends = species.bends(rng, 1)
-    if walls is None:
-        walls = np.zeros((n, WALL_COLUMNS))
+    walls = np.zeros((n, WALL_COLUMNS)) if walls is None else walls
     for start in range(0, n, _BLOCK):
         part = slice(start, min(start + _BLOCK, n))
         one = np.zeros(part.stop - start, np.int64)
