@@ -260,8 +260,13 @@ class Cascade:
             candidates.scale,
             kernels.FeatureRows(views, scalars),
         )
-        inverse_size = (1.0 / candidates.size).astype(np.float32)
-        return Samples(images.heights, candidates.image, inverse_size, views, scalars)
+        return Samples(
+            images.heights,
+            candidates.image,
+            (1.0 / candidates.size).astype(np.float32),
+            views,
+            scalars,
+        )
 
     @cached_property
     def balls(self) -> Spheres:
@@ -311,13 +316,12 @@ class Cascade:
                 c.size,
             )
         else:
-            axes = self.skeleton.axes[joint]
             in_parallel(
                 kernels.correct_joint_all,
                 len(c),
                 joint,
                 c.rotations,
-                axes,
+                self.skeleton.axes[joint],
                 values,
                 method.joint_lever_mm,
             )

@@ -187,8 +187,9 @@ class PoseEstimator:
         except ValueError as error:
             raise ModelError(f"this model cannot be used ({error}); train it again") from None
         regressors = [forest for rounds in model.cascade.forests for forest in rounds]
-        pruner = model.pruner or model.metric
-        return kernels.Forests(_pack(regressors), _pack([pruner]), _pack([model.metric]))
+        return kernels.Forests(
+            _pack(regressors), _pack([model.pruner or model.metric]), _pack([model.metric])
+        )
 
     @cached_property
     def _body(self) -> SphereModel:
@@ -411,8 +412,9 @@ class PoseEstimator:
         size = size if self.model.method.session_size else 1.0
         usable = detection.usable
         some = detection[np.flatnonzero(usable)]
-        picked = self.pick(some, size, parallel)
-        whole = with_expected_error(picked, self.model, some.images, size).spread_over(usable)
+        whole = with_expected_error(
+            self.pick(some, size, parallel), self.model, some.images, size
+        ).spread_over(usable)
         pose = whole.pose.moved(view_of(detection.crop_cameras).inverse())
         return Estimates(replace(whole, pose=pose), usable, detection.crops)
 
@@ -447,8 +449,9 @@ class PoseEstimator:
             picked = corrected(picked, self.model, images, size)
             if self.model.settler is None:
                 return picked
-            ridge = RidgeCorrection(skeleton, self.model.settler)
-            pose, grown, clear = ridge.correct(picked.pose, images, size)
+            pose, grown, clear = RidgeCorrection(skeleton, self.model.settler).correct(
+                picked.pose, images, size
+            )
         return replace(picked, pose=pose, frame_scale=size * np.exp(grown), scale_trust=clear)
 
     def find_size(self, sample: NDArray[np.float32], scene: Segmenter) -> float:

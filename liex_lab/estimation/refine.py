@@ -436,8 +436,11 @@ class HeadTailClassifier:
         resampled = laid_along(self.skeleton, images, joints, np.full(len(joints), size))
         views = np.concatenate([resampled, resampled[:, :, ::-1]])
         flat = views.reshape(len(views), -1).astype(np.float64)
-        both = self.network.logits(flat).reshape(2, -1)
-        return np.clip(both, -_MOST_LOGIT, _MOST_LOGIT).mean(axis=0).round(6)
+        return (
+            np.clip(self.network.logits(flat).reshape(2, -1), -_MOST_LOGIT, _MOST_LOGIT)
+            .mean(axis=0)
+            .round(6)
+        )
 
     def judged(self, images: ImageSet, positions: Array, scores: Array, size: float) -> Array:
         """Adjust the candidates' scores by the network if the metric is unsure of the direction.

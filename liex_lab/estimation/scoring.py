@@ -147,8 +147,7 @@ def choose(
     sd_mm = expected[:, None] * share / np.sqrt(3.0)
     sd_root, sd_angles = _spread_of_coordinates(skeleton, pose, turned, joints, weight)
     # the score of the opposite direction if no candidate has it
-    no_opposite_mm = 40.0 * skeleton.relative_size
-    doubts = _doubts(positions, scores, mean, score, size, no_opposite_mm)
+    doubts = _doubts(positions, scores, mean, score, size, 40.0 * skeleton.relative_size)
     return Chosen(
         pose,
         sd_root,

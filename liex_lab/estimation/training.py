@@ -142,8 +142,9 @@ def train_cascade(
             labels, keep = cascade.labels(candidates, joint, data.truth)
             samples = cascade.samples(data.images, candidates, [joint])
             keep &= data.animal[candidates.image]
-            rows = np.ascontiguousarray(labels, np.float32)
-            forest, in_bag = grow_forest(samples, rows, keep, method.regressors, rng)
+            forest, in_bag = grow_forest(
+                samples, np.ascontiguousarray(labels, np.float32), keep, method.regressors, rng
+            )
             forest = forest.quantised()
             values = cascade.predict(forest, samples, in_bag if method.out_of_bag else None)
             cascade.apply(candidates, joint, values)
@@ -272,8 +273,9 @@ def train_pruner(
     if plan is None:
         return None
     samples = cascade.samples(data.images, candidates, [0])
-    labels = _capped_error(cascade, candidates, data.truth)
-    return boost_forest(samples, labels, plan, 0.3, rng).quantised()
+    return boost_forest(
+        samples, _capped_error(cascade, candidates, data.truth), plan, 0.3, rng
+    ).quantised()
 
 
 # Stacking on held-out images: corrections, head-tail classifier and error calibration of a model.
@@ -391,8 +393,9 @@ def with_corrector(model: Model, data: TrainingSet, rng: np.random.Generator) ->
         parts.append(samples[np.flatnonzero(near)])
         move = np.einsum("nji,nkj->nki", frames.rotation[:, 0], off) / size
         moves.append(move.reshape(len(move), -1)[near])
-    labels = np.concatenate(moves).astype(np.float32)
-    forest = boost_forest(Samples.join(parts), labels, plan, 0.1, rng)
+    forest = boost_forest(
+        Samples.join(parts), np.concatenate(moves).astype(np.float32), plan, 0.1, rng
+    )
     return replace(model, corrector=forest.quantised())
 
 
@@ -439,10 +442,12 @@ def with_facing(model: Model, data: TrainingSet, seed: int) -> Model:
         for k, exists in ((best, np.isfinite(scores.min(axis=1))), (opposite, np.isfinite(behind))):
             some = np.flatnonzero(exists)
             joints = detection.positions[some, k[some]]
-            sizes = np.full(len(some), size)
-            resampled.append(laid_along(skeleton, detection.images[some], joints, sizes))
-            direction = joints[:, skeleton.tip] - joints[:, 0]
-            right.append(np.einsum("nd,nd->n", direction, along[some]) > 0)
+            resampled.append(
+                laid_along(skeleton, detection.images[some], joints, np.full(len(some), size))
+            )
+            right.append(
+                np.einsum("nd,nd->n", joints[:, skeleton.tip] - joints[:, 0], along[some]) > 0
+            )
     network = HeadTailClassifier.fit(np.concatenate(resampled), np.concatenate(right), seed)
     return replace(model, facing=network)
 
@@ -450,8 +455,9 @@ def with_facing(model: Model, data: TrainingSet, seed: int) -> Model:
 def _on_own_maps(samples: Samples) -> Samples:
     """The samples, each on a height map of its own, so that bags are drawn over samples."""
     n = len(samples)
-    heights = np.zeros((n, 1, 1), np.int16)
-    return replace(samples, heights=heights, image=np.arange(n, dtype=np.int32))
+    return replace(
+        samples, heights=np.zeros((n, 1, 1), np.int16), image=np.arange(n, dtype=np.int32)
+    )
 
 
 def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Model:
@@ -480,15 +486,19 @@ def calibrate(model: Model, data: TrainingSet, rng: np.random.Generator) -> Mode
     for k in range(_FOLDS):
         others = np.flatnonzero(fold != k)
         held_out = np.flatnonzero(fold == k)
-        learned_from = _on_own_maps(trial.clues[others])
-        forest = boost_forest(learned_from, target[others], _EXPECTATION, _SHRINKAGE, rng)
+        forest = boost_forest(
+            _on_own_maps(trial.clues[others]), target[others], _EXPECTATION, _SHRINKAGE, rng
+        )
         predicted[held_out] = np.exp(predict(forest, trial.clues[held_out])[:, 0] / LOG_UNIT)
     gain = capped.mean() / predicted.mean()  # from the median of the expected error to its mean
     predicted = np.maximum(gain * predicted, LEAST_MM * model.skeleton.relative_size)
     low, high = np.quantile(error / predicted, [0.05, 0.95])
-    shifted = target + np.float32(LOG_UNIT * np.log(gain))
     expectation = boost_forest(
-        _on_own_maps(trial.clues), shifted, _EXPECTATION, _SHRINKAGE, rng
+        _on_own_maps(trial.clues),
+        target + np.float32(LOG_UNIT * np.log(gain)),
+        _EXPECTATION,
+        _SHRINKAGE,
+        rng,
     ).quantised()
     design = np.stack([np.ones(n), trial.score, trial.spread], axis=1)
     line, *_ = np.linalg.lstsq(design, capped, rcond=None)

@@ -238,9 +238,8 @@ def wandering(levels: Array) -> tuple[float, float] | None:
         return None
     low, high = np.percentile(levels, [5, 95])
     wander = float(high - low)
-    rough = float(np.abs(np.diff(levels)).mean())
     # less is noise, more another scene or a displaced camera; a rough course is no drift
-    if not 2.0 <= wander <= 30.0 or rough > 0.25 * wander:
+    if not 2.0 <= wander <= 30.0 or float(np.abs(np.diff(levels)).mean()) > 0.25 * wander:
         return None
     first = max(3, round(0.05 * len(levels)))  # the beginning
     return float(np.median(levels[:first])), wander
@@ -353,8 +352,7 @@ class SceneChange:
 
 def _usual(depths: NDArray[np.float32]) -> NDArray[np.float32]:
     """The median (P,) of the readings in frames (n, P), mm; 0 where most are unread."""
-    often = 2 * (depths > 0).sum(axis=0) >= len(depths)
-    return np.where(often, usual_depth(depths), np.float32(0))
+    return np.where(2 * (depths > 0).sum(axis=0) >= len(depths), usual_depth(depths), np.float32(0))
 
 
 # The empty scene of sampled frames: background, floor and foreground limit.

@@ -141,9 +141,13 @@ class BackgroundSubtraction(Segmenter):
         An animal that swims or is lifted is judged by its area alone, as the space below it is not
         its own.
         """
-        stands = self.view.frame == VIEWS[0]
         # of the logarithms, from posture to posture of one animal
-        return size_misfit(crops, self.area_mm2, self.volume_mm3 if stands else None, (0.25, 0.2))
+        return size_misfit(
+            crops,
+            self.area_mm2,
+            self.volume_mm3 if self.view.frame == VIEWS[0] else None,
+            (0.25, 0.2),
+        )
 
     def view_rotation(self, camera_view: bool) -> Array:
         """Rotation (3, 3) of T_view_camera: the arena's, or that of an upright camera frame.
@@ -297,8 +301,7 @@ class BackgroundSubtraction(Segmenter):
         ]
         distance = np.abs(np.log(np.maximum(areas, 1e-9)[None] / tried[:, None, None])).min(axis=2)
         support = np.exp(-0.5 * (distance / 0.35) ** 2).sum(axis=1)
-        best = tried[np.argmax(support)]
-        return float(best), float(
+        return float(tried[np.argmax(support)]), float(
             (distance[np.argmax(support)] < np.log(kernels.AREA_FACTOR)).mean()
         )
 

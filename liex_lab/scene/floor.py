@@ -304,8 +304,9 @@ def floor_patch(background: NDArray[np.float32], bare: NDArray[np.float32]) -> M
     """
     import cv2
 
-    flat = near_plane(background, bare).astype(np.uint8)
-    opened = cv2.morphologyEx(flat, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    opened = cv2.morphologyEx(
+        near_plane(background, bare).astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)
+    )
     labels, stats = components(opened)
     # row 0, the surroundings, counts no pixels
     return labels == (int(np.argmax(stats[:, cv2.CC_STAT_AREA])) or -1)
@@ -427,8 +428,7 @@ def _patches(
     import cv2
 
     height, width = background.shape
-    bare = floor.depth(width, height)
-    flat = near_plane(background, bare)
+    flat = near_plane(background, floor.depth(width, height))
     holes = cv2.morphologyEx(flat.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     whole = flat | ((holes > 0) & (background == 0))
     opened = cv2.morphologyEx(whole.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
@@ -463,8 +463,9 @@ def _enclosed(background: NDArray[np.float32], patch: Mask, floor: Floor, camera
     hull = convex_hull(patch)
     reach = 2 * max(6, background.shape[1] // 40) + 1  # width of the inspected surroundings
     v, u = np.mgrid[0 : background.shape[0], 0 : background.shape[1]]
-    above = floor.heights(u, v, background)
-    high = np.where((background > 0) & ~hull, above, -1e6).astype(np.float32)
+    high = np.where((background > 0) & ~hull, floor.heights(u, v, background), -1e6).astype(
+        np.float32
+    )
     highest = cv2.dilate(high, np.ones((reach, reach), np.uint8))
     ring = (cv2.dilate(hull.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~hull
     n_cut = int(hull[0].sum() + hull[-1].sum() + hull[:, 0].sum() + hull[:, -1].sum())

@@ -120,15 +120,15 @@ def in_camera_frame(points: Array, crop_cameras: Array) -> Array:
     Returns:
         (n, ..., 3) mm, camera frames.
     """
-    offset = points - _camera_centre(points, crop_cameras)
-    return np.einsum("nji,n...j->n...i", _rotations(crop_cameras), offset)
+    return np.einsum(
+        "nji,n...j->n...i", _rotations(crop_cameras), points - _camera_centre(points, crop_cameras)
+    )
 
 
 def _camera_centre(points: Array, crop_cameras: Array) -> Array:
     """The camera's centre (n, ..., 3) mm in the view frames, to be added to points (n, ..., 3)."""
     centre = np.zeros((len(crop_cameras), *(1,) * (points.ndim - 2), 3))
-    distance = crop_columns(crop_cameras).distance
-    centre[..., 2] = distance.reshape(-1, *(1,) * (points.ndim - 2))
+    centre[..., 2] = crop_columns(crop_cameras).distance.reshape(-1, *(1,) * (points.ndim - 2))
     return centre
 
 
@@ -250,8 +250,9 @@ def size_misfit(
     """
     misfit = (np.log(np.maximum(crops.blobs.area_mm2, 1.0) / area_mm2) / sd[0]) ** 2
     if volume_mm3 is not None:
-        volume = np.maximum(crops.blobs.volume_mm3, 1.0)
-        misfit = misfit + (np.log(volume / volume_mm3) / sd[1]) ** 2
+        misfit = (
+            misfit + (np.log(np.maximum(crops.blobs.volume_mm3, 1.0) / volume_mm3) / sd[1]) ** 2
+        )
     return np.asarray(misfit)
 
 

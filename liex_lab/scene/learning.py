@@ -326,8 +326,11 @@ def _on_bare_floor(scene: Scene, sample: Depths, target: TargetAnimal, kinds: in
 
 def _lumps(scene: Scene, target: TargetAnimal) -> Iterator[Mask]:
     """The lumps (H, W) bool of the background on the floor."""
-    above = scene.bare - scene.background
-    raised = scene.on_floor & (scene.background > 0) & (above > target.min_height_mm)
+    raised = (
+        scene.on_floor
+        & (scene.background > 0)
+        & (scene.bare - scene.background > target.min_height_mm)
+    )
     return parts(raised, 16)
 
 
@@ -349,8 +352,11 @@ def _with_floor_at(scene: Scene, where: Mask, target: TargetAnimal) -> Scene:
     limit = np.where(
         there, np.maximum(scene.bare - np.float32(target.min_height_mm), 0), scene.limit
     )
-    background = np.where(there, scene.bare, scene.background)
-    return replace(scene, background=background, limit=limit.astype(np.float32))
+    return replace(
+        scene,
+        background=np.where(there, scene.bare, scene.background),
+        limit=limit.astype(np.float32),
+    )
 
 
 def _areas_at(
@@ -452,8 +458,7 @@ def learn_scene(
     scene = replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed)
     scene = replace(scene, sensor=read_sensor(scene, sample))
     if target.stands_on_floor and changed is None:
-        found = find_transient_objects(scene, sample, times_s)
-        scene = replace(scene, transient_objects=found)
+        scene = replace(scene, transient_objects=find_transient_objects(scene, sample, times_s))
     return scene, sample
 
 
@@ -503,8 +508,7 @@ def _with_its_animal(scene: Scene, sample: Depths, target: TargetAnimal) -> Scen
         area = scene.area_mm2
     # an object that does not move must have an animal's size and height
     if target.stands_on_floor and share > 0.0 and not moves:
-        as_animal = replace(scene, area_mm2=area)
-        share = share if is_like_an_animal(as_animal, sample, target) else 0.0
+        share = share if is_like_an_animal(replace(scene, area_mm2=area), sample, target) else 0.0
     if share == 0.0:
         raise EstimationError(
             f"no animal was found in {len(sample)} frames spread over the recording: nothing "

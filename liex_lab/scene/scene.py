@@ -468,8 +468,9 @@ def region_corners(region: Mask | None, stride: int) -> tuple[tuple[float, float
     if region is None or not region.any():
         return ()
     hull = cv2.convexHull(cv2.findNonZero(region.astype(np.uint8)))
-    short = cv2.approxPolyDP(hull, 1.5, True)[:, 0]
-    return tuple((float(u) * stride, float(v) * stride) for u, v in short)
+    return tuple(
+        (float(u) * stride, float(v) * stride) for u, v in cv2.approxPolyDP(hull, 1.5, True)[:, 0]
+    )
 
 
 def plane_of(point: Sequence[float], normal: Sequence[float], camera: Camera) -> Floor:
@@ -564,5 +565,6 @@ def fixture_at(mask: Mask, depth: NDArray[np.float32], floor: Floor, camera: Cam
     pixels = np.stack([columns, rows], axis=1).astype(float)
     points = floor.T_arena_camera @ camera.unproject(pixels, z)
     middle = points[:, :2].mean(axis=0)
-    top = float(np.percentile(points[:, 2], 95))
-    return Fixture((float(middle[0]), float(middle[1])), top, area)
+    return Fixture(
+        (float(middle[0]), float(middle[1])), float(np.percentile(points[:, 2], 95)), area
+    )

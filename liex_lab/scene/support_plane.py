@@ -102,9 +102,8 @@ class MovingObject:
 
     def is_on(self, floor: Floor, patch: NDArray[np.bool_]) -> bool:
         """Whether it stands on a patch (H, W) bool of a floor."""
-        share = float(patch[self.rows, self.columns].mean())
         # of the ground around it is part of the patch
-        return self.stands_on(floor) and share > 0.25
+        return self.stands_on(floor) and float(patch[self.rows, self.columns].mean()) > 0.25
 
 
 @dataclass(frozen=True)
@@ -264,9 +263,14 @@ def _choose(scene: SampledScene, movers: list[MovingObject]) -> SupportPlane:
         reach = scene.target.spine_mm[1] * np.sqrt(camera.fx * camera.fy) / ground.floor.distance_mm
         on_floor = convex_hull(ground.patch)
         region = ground.region(float(reach))
-        origin = WALLED if doubt else BY_SUPPORT
         return SupportPlane(
-            ground.floor, on_floor, region, len(movers), support, origin=origin, doubt=doubt
+            ground.floor,
+            on_floor,
+            region,
+            len(movers),
+            support,
+            origin=WALLED if doubt else BY_SUPPORT,
+            doubt=doubt,
         )
     if refusal is not None:
         raise refusal
@@ -324,8 +328,7 @@ def _as_stated(
     Raises:
         EstimationError: the movers do not stand on it, or none of it is visible.
     """
-    bare = floor.depth(camera.width, camera.height)
-    on_floor = floor_region(background, bare)
+    on_floor = floor_region(background, floor.depth(camera.width, camera.height))
     support = _share(movers, [mover.stands_on(floor) for mover in movers])
     # a stated floor that supports less is wrong
     if not on_floor.any() or (len(movers) >= _MIN_MOVERS and support < 0.1):

@@ -119,8 +119,10 @@ class Worn(ABC):
         """Heights (H, W) of the parts that are wider than the device."""
         # a one-pixel hole does not split a body
         closed = cv2.morphologyEx(height, cv2.MORPH_CLOSE, _SQUARE)
-        side = np.ones((self._side,) * 2, np.uint8)
-        return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, side), np.float32)
+        return np.asarray(
+            cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((self._side,) * 2, np.uint8)),
+            np.float32,
+        )
 
     def _replace(self, depth: Depths, height: Depths, worn: Mask, most_mm: float = np.inf) -> None:
         """Replace pixels of an image by the animal beneath, at most `most_mm` high, in place."""
@@ -288,8 +290,9 @@ class Cable(Worn):
         """
         share = np.mean([a != b for a, b in zip(sample, cut, strict=True)], axis=0)
         # the mixed readings beside them belong to the arena, too
-        edge = np.ones((5, 5), np.uint8)
-        return replace(self, fixed=cv2.dilate((share > 0.5).astype(np.uint8), edge) > 0)
+        return replace(
+            self, fixed=cv2.dilate((share > 0.5).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        )
 
     def every(self, step: int) -> Cable:
         """The same for every `step`-th row and column of the image."""

@@ -223,8 +223,9 @@ class HypothesisAssociation:
             return np.zeros(len(path))
         taken = path[used]
         here, reversed_ = emission[used, taken], emission[used, taken ^ 1]
-        most = self._tuning.score_most + here
-        evidence = np.where(np.isfinite(reversed_), reversed_, most) - here
+        evidence = (
+            np.where(np.isfinite(reversed_), reversed_, self._tuning.score_most + here) - here
+        )
         one, two = (allocate((len(used), *joints.shape[2:]), joints.dtype) for _ in range(2))
         for part in blocks(len(used), _BLOCK):
             one[part] = joints[used[part], taken[part]]
@@ -303,8 +304,7 @@ def cost_of_the_other(observed: Observations, path: NDArray[np.int64]) -> Array 
     # smaller differences are none
     if usual < 0.08 or not len(own) or not _keeps_order(own, np.flatnonzero(followed)):
         return None
-    fits = _better_fit(observed, ratio, apart)
-    is_larger = fits or (1.0 if own.sum() > 0.0 else -1.0)
+    is_larger = _better_fit(observed, ratio, apart) or (1.0 if own.sum() > 0.0 else -1.0)
     evidence = np.clip(2.0 * is_larger * usual / noise**2 * ratio, -_MOST, _MOST)
     cost = np.zeros(observed.score.shape)
     cost[:, :2] = np.maximum(-evidence, 0.0)[:, None]

@@ -196,8 +196,9 @@ def track_whole(
                 draw(rows)
     measured = used & (path >= 0)
     _bridge_and_flag(subject, observed, path, doubt, measured, in_view, usual_px, track)
-    flips = [*_flips(observed, track), *corrections]
-    ordered = sorted(flips, key=lambda flip: (flip.start, flip.source))
+    ordered = sorted(
+        [*_flips(observed, track), *corrections], key=lambda flip: (flip.start, flip.source)
+    )
     return Tracked(track, tuple(ordered), tuple(cuts))
 
 
@@ -289,8 +290,7 @@ def _half_turns(
 
     def ahead(row: int) -> Array:
         """From base to tip (3,) of the pose in a `row`, mm."""
-        ends = [0, observed.skeleton.tip]
-        base, tip = observed[row : row + 1].joints_as(int(path[row]), ends)[0]
+        base, tip = observed[row : row + 1].joints_as(int(path[row]), [0, observed.skeleton.tip])[0]
         return (tip - base) * (-1.0) ** turned[row]
 
     ends = ends_of(exchanged)

@@ -168,9 +168,13 @@ def fit_shape(
     else:
         held_out, fitted, labels = good, good, stated.labels
     build = Build.of(prior, labels)
-    surface = built(skeleton, build.width, build.height)
     own = BodyResidual.fit(
-        surface, poses(fitted, build), estimates.crops[fitted], scene, camera_view, size
+        built(skeleton, build.width, build.height),
+        poses(fitted, build),
+        estimates.crops[fitted],
+        scene,
+        camera_view,
+        size,
     )
     crops = estimates.crops[held_out]
     before = average.of(poses(held_out), crops, scene)

@@ -185,8 +185,9 @@ def render_crops(
     T_camera_arena = SE3(
         np.broadcast_to(T.rotation, (n, 3, 3)).copy(), np.broadcast_to(T.translation, (n, 3)).copy()
     )
-    origin = crops.origin / step[:, None]
-    return render_meshes(vertices, surface.faces, T_camera_arena, scaled, origin, (CROP, CROP))
+    return render_meshes(
+        vertices, surface.faces, T_camera_arena, scaled, crops.origin / step[:, None], (CROP, CROP)
+    )
 
 
 @kernel(nogil=True)

@@ -447,8 +447,9 @@ def _smooth_once(
     for j, a in body.free:
         kernels.smooth_values(measured.angles[:, j, a].copy(), used, start, bend[a], value, rate)
         made.angles[:, j, a] = value
-    size = fill(0, motion.size)
-    kernels.smooth_values(measured.log_scale, used, start, size, made.log_scale, rate)
+    kernels.smooth_values(
+        measured.log_scale, used, start, fill(0, motion.size), made.log_scale, rate
+    )
     kernels.place_middles(body, out, made)
 
 
@@ -580,8 +581,14 @@ def _smoothed(
         covariances = kernels.Covariances.blank(n)
         kernels.gains(seconds, share * variance, drive, decay_s, start, gain, covariances)
         for column in [group] if group < 6 else range(group, n_coordinates, 3):
-            measured = np.ascontiguousarray(off[:, column])
-            kernels.smooth_values(measured, known, start, gain, made[:, column], np.zeros(n))
+            kernels.smooth_values(
+                np.ascontiguousarray(off[:, column]),
+                known,
+                start,
+                gain,
+                made[:, column],
+                np.zeros(n),
+            )
     return made
 
 

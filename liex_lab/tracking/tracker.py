@@ -171,7 +171,6 @@ class FrameTracker:
         """The animal of the track, with the limits and shares of this recording."""
         skeleton = self.estimator.skeleton
         share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
-        motion = TrackingParameters.of(skeleton.name).motion
         return Subject(
             skeleton,
             self.scene.camera,
@@ -180,7 +179,7 @@ class FrameTracker:
             self.doubtful_mm,
             self.bridge_s,
             share,
-            motion.stretch_sd(self.blur, self.size_spread),
+            TrackingParameters.of(skeleton.name).motion.stretch_sd(self.blur, self.size_spread),
             self.shape.build.unseen if self.shape and self.shape.build else None,
             1 if self.sample_fit is None else self.sample_fit.n_animals,
         )
@@ -308,8 +307,9 @@ def _body_of(
         body = BodyResidual.fit(average, pose, estimates.crops[used], scene, camera_view, size)
     if not adapt:
         return body, None
-    prior = ShapePrior.of(estimator.skeleton.name)
-    shape, body = fit_shape(prior, estimator, scene, estimates, size, body, stated)
+    shape, body = fit_shape(
+        ShapePrior.of(estimator.skeleton.name), estimator, scene, estimates, size, body, stated
+    )
     return body, shape
 
 
@@ -355,8 +355,9 @@ def _count(
     pose = other.chosen.pose.moved(scene.floor.T_arena_camera)[there]
     crops = other.crops[there]
     if there.any():  # another animal has its own girth and size
-        surface = Surface.of(estimator.skeleton)
-        body = BodyResidual.fit(surface, pose, crops, scene, body.camera_view)
+        body = BodyResidual.fit(
+            Surface.of(estimator.skeleton), pose, crops, scene, body.camera_view
+        )
     # scaled from the inspected frames to all frames
     n = len(n_candidates) * len(rows) // len(unsure)
     return count_animals(first, body.agreement(pose, crops, scene), rows[there], n)
@@ -444,9 +445,14 @@ class PatchObserver:
         skeleton = self.estimator.skeleton
         calibration = self.estimator.model.calibration
         share = calibration.joint_share or (1.0,) * skeleton.n_joints
-        doubtful_mm = calibration.doubtful_mm * size
         return Subject(
-            skeleton, camera, T_arena_camera, size * skeleton.length, doubtful_mm, BRIDGE_S, share
+            skeleton,
+            camera,
+            T_arena_camera,
+            size * skeleton.length,
+            calibration.doubtful_mm * size,
+            BRIDGE_S,
+            share,
         )
 
     def _cut(self, windows: Patches, size: float) -> tuple[HeightMaps, Array]:
@@ -455,5 +461,9 @@ class PatchObserver:
         n = len(windows.depth)
         used = size if model.method.session_size else 1.0
         area = np.full(n, model.calibration.area_mm2 * size**2)
-        lowest = self.estimator.skeleton.view.min_height_mm
-        return windows.extract(np.full(n, used), area, lowest, model.method.camera_view)
+        return windows.extract(
+            np.full(n, used),
+            area,
+            self.estimator.skeleton.view.min_height_mm,
+            model.method.camera_view,
+        )

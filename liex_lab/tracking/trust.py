@@ -56,9 +56,10 @@ def contradicted(
         False if there is no hypothesis, or its agreement with the depth image is unknown.
     """
     residual = observed.along(observed.residual_mm, path)
-    usual = finite_median(residual, 0.0)
     # a smaller residual is never a contradiction, even in a low-noise session
-    limit = min(max(4.0 * usual, 0.04 * length_mm), MOST_RESIDUAL * length_mm)
+    limit = min(
+        max(4.0 * finite_median(residual, 0.0), 0.04 * length_mm), MOST_RESIDUAL * length_mm
+    )
     with np.errstate(invalid="ignore"):
         return np.asarray(
             (residual > limit)
