@@ -98,7 +98,13 @@ def check_square(
     np.testing.assert_allclose(centre[:, :2], [plate.centre for plate in shown], atol=0.8)
 
 
-@pytest.mark.parametrize("camera", PRESETS, ids=lambda camera: camera.source)
+@pytest.mark.parametrize(
+    "camera",
+    [
+        pytest.param(camera, id=camera.source, marks=pytest.mark.nightly if k % 3 else ())
+        for k, camera in enumerate(PRESETS)
+    ],
+)
 def test_a_square_is_as_large_as_it_is_for_every_camera_preset(
     tmp_path: Path, camera: Camera
 ) -> None:
@@ -107,8 +113,11 @@ def test_a_square_is_as_large_as_it_is_for_every_camera_preset(
 
 @pytest.mark.parametrize(
     ("camera", "lens"),
-    [(KINECT_V2, BARREL), (PRIMESENSE, PINCUSHION), (KINECT_V2, FISHEYE)],
-    ids=["barrel", "pincushion", "fisheye"],
+    [
+        pytest.param(KINECT_V2, BARREL, id="barrel"),
+        pytest.param(PRIMESENSE, PINCUSHION, id="pincushion", marks=pytest.mark.nightly),
+        pytest.param(KINECT_V2, FISHEYE, id="fisheye"),
+    ],
 )
 def test_and_through_a_bent_lens(tmp_path: Path, camera: Camera, lens: Distortion) -> None:
     check_square(tmp_path / "r", replace(camera, distortion=lens))
@@ -117,8 +126,12 @@ def test_and_through_a_bent_lens(tmp_path: Path, camera: Camera, lens: Distortio
 @pytest.mark.parametrize(
     ("camera", "water"),
     [
-        (KINECT_V2, Water(450.0, ranging="time_of_flight")),
-        (PRIMESENSE_QVGA, Water(450.0, ranging="structured_light")),
+        pytest.param(KINECT_V2, Water(450.0, ranging="time_of_flight"), marks=pytest.mark.nightly),
+        pytest.param(
+            PRIMESENSE_QVGA,
+            Water(450.0, ranging="structured_light"),
+            marks=pytest.mark.nightly,
+        ),
         (PRIMESENSE_QVGA, Water(400.0, 1.34, 0.04, -0.03, "structured_light")),
         (replace(KINECT_V2, distortion=BARREL), Water(400.0, ranging="light_field")),
     ],
