@@ -96,7 +96,7 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
     fit = found.fit
     summary = (
         f"{found.name} fits: {fit.spine_mm:.0f} mm long, expected error {fit.error_mm:.1f} mm, its "
-        f"body covers {fit.covered:.0%} of what is seen"
+        f"body covers {fit.covered:.0%} of what is visible"
     )
     problems = list(_other_hand(recording, found, plan))
     if plan is not None and found is not first:

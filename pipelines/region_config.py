@@ -194,7 +194,7 @@ class StatedRegions:
             ],
             "place": counts.name,
             "region": corners,
-            "said": said,
+            "message": said,
             "recording": self._recording(key, session),
             "has_recording": self._study is not None and self._planned(key)[1].recording_exists,
         }

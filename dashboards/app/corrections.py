@@ -50,7 +50,7 @@ class Ticket:
         folder: the session folder.
         what: the correction; None undoes one.
         author: the author of the request.
-        said: its effect, or why it failed.
+        message: its effect, or why it failed.
         undoes: number of the log entry to undo; 0 for a correction.
         id: its number in the queue.
         number: its own number in the log, once saved.
@@ -60,7 +60,7 @@ class Ticket:
     folder: Path
     what: Correction | None
     author: str
-    said: str
+    message: str
     undoes: int = 0
     id: int = 0
     number: int = 0
@@ -109,7 +109,7 @@ class Saver:
         with self._changed:
             self._changed.wait_for(lambda: ticket.state in (SAVED, FAILED))
         if ticket.state == FAILED:
-            raise LiexError(ticket.said)
+            raise LiexError(ticket.message)
 
     def tickets(self, folder: Path) -> dict[int, Ticket]:
         """The tickets of a session by their number, the latest last."""
@@ -204,7 +204,7 @@ class Saver:
         with self._changed:
             for ticket in batch:
                 ticket.state = state
-                ticket.said = reason or ticket.said
+                ticket.message = reason or ticket.message
                 self._waiting.remove(ticket)
             if state == SAVED and self._report is not None:
                 self._reports[batch[0].folder] = time.monotonic() + self._calm_s
@@ -228,7 +228,7 @@ class Clerk:
         try:
             return {**self._desks.of(key).about(), "may_correct": self._saver is not None}
         except LiexError as error:
-            return {"said": str(error)}
+            return {"message": str(error)}
 
     def times(self, key: str) -> Response:
         """The frame times of the session `key`, s; empty without poses."""
@@ -260,7 +260,7 @@ class Clerk:
             "unsaved": unsaved,
             "report_old": old,
             "tickets": {
-                str(n): {"state": one.state, "said": one.said, "number": one.number}
+                str(n): {"state": one.state, "message": one.message, "number": one.number}
                 for n, one in self._saver.tickets(desk.session.path).items()
             },
             "log": desk.log(),
@@ -281,7 +281,7 @@ class Clerk:
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
         saver = self._saver
         if saver is None or not isinstance(asked, dict):
-            return {"said": "no correction is taken here"}, 403 if saver is None else 400
+            return {"message": "no correction is taken here"}, 403 if saver is None else 400
         desk = self._desks.of(key)
         folder = desk.session.path
         author = _text(asked, "by")
@@ -292,9 +292,9 @@ class Clerk:
         else:
             what = correction_in(desk, _text(asked, "sentence"), _number(asked, "at_s"))
             if asked.get("try"):
-                return {"ticket": None, "said": str(what), **vars(what)}
+                return {"ticket": None, "message": str(what), **vars(what)}
             ticket = saver.add(folder, what, author)
-        return {"ticket": ticket.id, "said": ticket.said}
+        return {"ticket": ticket.id, "message": ticket.message}
 
 
 def _number_of(saver: Saver, folder: Path, asked: dict[str, Any]) -> int:
@@ -320,7 +320,7 @@ def _redo(saver: Saver, folder: Path, author: str) -> dict[str, Any]:
         raise SessionError("nothing was taken back since the last new correction")
     number, what = log.redoable
     ticket = saver.take_back(folder, number, author)
-    return {"ticket": ticket.id, "said": f"made again: {what}", "number": log.undos[number]}
+    return {"ticket": ticket.id, "message": f"made again: {what}", "number": log.undos[number]}
 
 
 def correction_in(desk: Desk, sentence: str, at_s: float) -> Correction:

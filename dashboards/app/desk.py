@@ -161,11 +161,11 @@ class Desk(Footage):
         return crossings(self.session, self.animals)
 
     def log(self) -> list[dict[str, Any]]:
-        """The corrections in effect: number, message (said), author and date."""
+        """The corrections in effect: number, message, author and date."""
         return [
             {
                 "number": entry.number,
-                "said": str(entry.what),
+                "message": str(entry.what),
                 "author": entry.author,
                 "made_at": entry.made_at,
             }

@@ -162,13 +162,13 @@ class Pages:
         entry = self.data.entries.get(key)
         if entry is None:
             reason = "The study has no session of this name."
-            return render_template("sentence.html", title="No such session", said=reason), 404
+            return render_template("sentence.html", title="No such session", message=reason), 404
         if entry not in self.data.done:
             reason = "; ".join(filter(None, (entry.reason, entry.remedy)))
             more = {"arena": f"/arena/{quote(key, safe='')}"} if self._of_recordings else {}
             what = {"kind": "session", "title": key, "state": entry.state}
             reason = reason or "it has not been measured yet"
-            return render_template("sentence.html", said=reason, **what, **more)
+            return render_template("sentence.html", message=reason, **what, **more)
         return render_template(
             "session.html",
             **session_facts(self.data, key),
@@ -222,9 +222,9 @@ class Pages:
         asked = request.get_json(silent=True)  # a form of another site cannot send JSON
         at_s = asked.get("at_s") if isinstance(asked, dict) else None
         if self._show_replay is None or not isinstance(at_s, int | float):
-            return {"said": "no replay is opened here"}, 403
+            return {"message": "no replay is opened here"}, 403
         self._show_replay(self.data.session(key).path / "session.rrd", float(at_s))
-        return {"said": f"Rerun shows the replay at {at_s:.3f} s."}
+        return {"message": f"Rerun shows the replay at {at_s:.3f} s."}
 
     def figure(self, key: str, name: str) -> Response:
         """SVG of a figure of a session."""
@@ -251,12 +251,14 @@ def add_handlers(app: Flask, pages: Pages) -> None:
     @app.errorhandler(LiexError)
     def refused(error: LiexError) -> Any:
         if request.accept_mimetypes.best == "text/html":  # a page, not one of its scripts
-            return render_template("sentence.html", title="This cannot be shown", said=str(error))
-        return {"said": str(error)}, 400
+            return render_template(
+                "sentence.html", title="This cannot be shown", message=str(error)
+            )
+        return {"message": str(error)}, 400
 
     @app.errorhandler(404)
     def absent(_: NotFound) -> Any:
-        return render_template("sentence.html", title="No such page", said=""), 404
+        return render_template("sentence.html", title="No such page", message=""), 404
 
 
 def ethogram_rows(data: StudyData) -> dict[str, Any]:
@@ -329,7 +331,7 @@ def _bars(
                 "at": 100.0 * a / n,
                 "width": 100.0 * (b - a) / n,
                 "word": word,
-                "said": (f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}"),
+                "label": f"{at:.2f} {unit[0]}: {word.replace('_', ' ')}",
             }
         )
     return bars
@@ -347,7 +349,12 @@ def _shares(
             parts[name] = parts.get(name, 0.0) + 100.0 * share
     ends = np.cumsum([0.0, *parts.values()])
     return [
-        {"at": at, "width": share, "word": word, "said": f"{word.replace('_', ' ')}: {share:.1f} %"}
+        {
+            "at": at,
+            "width": share,
+            "word": word,
+            "label": f"{word.replace('_', ' ')}: {share:.1f} %",
+        }
         for (word, share), at in zip(parts.items(), ends, strict=False)
     ]
 

@@ -94,7 +94,7 @@ class Scenes:
         camera = self._whole(key)[1] if session is None else session.camera
         marks = [] if session is None else scene_marks(session)
         found = [
-            {"kind": mark.kind, "said": mark.label, "points": mark.points_px.round(1).tolist()}
+            {"kind": mark.kind, "label": mark.label, "points": mark.points_px.round(1).tolist()}
             for mark in marks
         ]
         size = {"width": camera.width, "height": camera.height}
@@ -110,7 +110,7 @@ class Scenes:
         """
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
         if self._regions is None or not isinstance(asked, dict):
-            return {"said": "no region is saved here"}, 403 if self._regions is None else 400
+            return {"message": "no region is saved here"}, 403 if self._regions is None else 400
         place = str(asked.get("place"))[:40]
         corners, was = asked.get("corners"), asked.get("was")
         report = self._regions.save(key, self._session(key), place, corners, was)
@@ -296,7 +296,7 @@ def _views(
         "GET /desk/<path:key>/state": clerk.state,
         "POST /desk/<path:key>/correct": clerk.correct,
         "GET /region/<path:key>/about": scenes.about,
-        "GET /region/<path:key>/picture.png": scenes.image,
+        "GET /region/<path:key>/image.png": scenes.image,
         "GET /region/<path:key>/scene.svg": scenes.scene,
         "POST /region/<path:key>/save": scenes.save,
     }

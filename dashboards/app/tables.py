@@ -198,7 +198,7 @@ def fill(table: Table, words: str = "", sorted_by: str = "", down: bool = False)
     extent += f"; the first {MOST_ROWS} are shown, the CSV has all" if n > MOST_ROWS else ""
     return {
         "heads": heads,
-        "said": extent,
+        "message": extent,
         "rows": [
             [_cell(table, row, column, places.get(column)) for column in table.shown]
             for row in records(rows.head(MOST_ROWS))
@@ -307,9 +307,9 @@ def _cell(
     if column == "reason" and "remedy" in row:
         texts = (str(row[name]) for name in ("reason", "remedy", "damage"))
         value = "; ".join(one for one in texts if one not in ("", "nan", "new"))
-        return {"kind": "said", "text": value}
+        return {"kind": "text", "text": value}
     if column in ("test", "refused"):
-        return {"kind": "said", "text": str(value)}
+        return {"kind": "text", "text": str(value)}
     text = number(value, places)
     if column.endswith("_share") and isinstance(value, int | float) and np.isfinite(value):
         text = f"{100 * value:.1f} %"

@@ -166,7 +166,7 @@ def test_a_person_corrects_by_sentences_and_takes_one_back(
     page.goto(f"{served.address}/session/{key}?t=2.5")
     page.wait_for_selector("#desk.is-open")
     page.get_by_text("Correct by a sentence").click()
-    sentence, said = page.locator("#correct-sentence"), page.locator(".desk-said")
+    sentence, said = page.locator("#correct-sentence"), page.locator(".desk-message")
     made = page.locator("#correct-made li")
 
     def correct(words: str, n: int) -> None:

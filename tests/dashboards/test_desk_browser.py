@@ -93,7 +93,7 @@ def test_a_joint_is_dragged_and_its_frame_follows(served: Served, watched: Watch
     page.mouse.down()
     page.mouse.move(x - 20, y + 8, steps=4)
     page.mouse.up()
-    expect(page.locator(".desk-said")).to_contain_text("nose of frame 30 to")
+    expect(page.locator(".desk-message")).to_contain_text("nose of frame 30 to")
     expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
     now = session(served)
     assert now.frames["flag"].iloc[row] == "corrected"
@@ -117,7 +117,7 @@ def test_a_joint_dragged_off_the_animal_keeps_its_height_and_can_be_redone(
     served: Served, watched: Watched
 ) -> None:
     page = watched.page
-    row, said = 75, page.locator(".desk-said")
+    row, said = 75, page.locator(".desk-message")
     stage = opened(served, page, float(MOUSE.times_s[row]))
     nose = session(served).poses.iloc[5 * row + 4]
     x, y = at_rest(page, stage, row, 4)
@@ -194,19 +194,19 @@ def test_an_action_is_named_by_a_key_and_taken_back_by_another(
     expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
     assert session(served).bouts["action"].tolist() == was
     page.keyboard.press("u")
-    expect(page.locator(".desk-said")).to_contain_text("nothing of this visit is left")
+    expect(page.locator(".desk-message")).to_contain_text("nothing of this visit is left")
     opened(served, page, 4.0)
     page.keyboard.press("[")  # a span of ten frames gets a bout of its own
     for _ in range(9):
         page.keyboard.press("ArrowRight")
     page.keyboard.press("]")
-    expect(page.locator(".desk-said")).to_contain_text("marked 4.00 to 4.33 s")
+    expect(page.locator(".desk-message")).to_contain_text("marked 4.00 to 4.33 s")
     page.keyboard.press(str(words.index(new) + 1))
     expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
     bouts = session(served).bouts
     assert bouts[bouts["action"] == new]["duration_s"].tolist() == pytest.approx([1 / 3], abs=0.01)
     page.keyboard.press("f")  # head and tail: this session has nothing to make the track of again
-    expect(page.locator(".desk-said.is-wrong")).to_be_visible()
+    expect(page.locator(".desk-message.is-wrong")).to_be_visible()
     assert len(read_log(served.study / f"{KEY}.liex").standing) == 1
     assert fits_a_phone(page)
     watched.nothing_went_wrong()
@@ -226,7 +226,7 @@ def test_f_exchanges_head_and_tail_in_the_marked_span_and_u_takes_it_back(
     stage = opened(tracked, page, 0.3)
     before, nose = to_nose(tracked), len(MOUSE.skeleton.names) - 1
     page.keyboard.press("x")
-    expect(page.locator(".desk-said")).to_contain_text("there is no crossing")
+    expect(page.locator(".desk-message")).to_contain_text("there is no crossing")
     page.keyboard.press("[")
     for _ in range(8):
         page.keyboard.press("ArrowRight")
@@ -235,14 +235,16 @@ def test_f_exchanges_head_and_tail_in_the_marked_span_and_u_takes_it_back(
         page.keyboard.press("ArrowLeft")
     nose_was = at_rest(page, stage, 13, nose)
     page.keyboard.press("f")
-    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged in frames 9 to 17")
+    expect(page.locator(".desk-message")).to_contain_text(
+        "head and tail exchanged in frames 9 to 17"
+    )
     expect(page.locator(".desk-saved")).to_contain_text("1 correction stands, all saved")
-    expect(page.locator(".desk-said")).to_contain_text("disagrees with the frames around it")
+    expect(page.locator(".desk-message")).to_contain_text("disagrees with the frames around it")
     agree = np.sum(before * to_nose(tracked), axis=1)
     assert np.flatnonzero(agree < 0).tolist() == list(range(9, 18))
     until(page, lambda: joint_on_screen(page, stage, 13, nose) != pytest.approx(nose_was, abs=20.0))
     page.keyboard.press("x")
-    expect(page.locator(".desk-said")).to_contain_text("head and tail exchanged by a person")
+    expect(page.locator(".desk-message")).to_contain_text("head and tail exchanged by a person")
     page.keyboard.press("u")
     expect(page.locator(".desk-saved")).to_contain_text("0 corrections stand, all saved")
     np.testing.assert_array_equal(to_nose(tracked), before)
@@ -302,26 +304,26 @@ def test_doubts_and_crossings_are_gone_to_one_after_the_other_and_stay_so(
     with page.expect_request("**/crossings"):
         opened(served, page, 0.0)
     page.keyboard.press("x")  # too early: gone to once it is found
-    expect(page.locator(".desk-said")).to_contain_text("crossings are still being looked for")
+    expect(page.locator(".desk-message")).to_contain_text("crossings are still being searched for")
     held.pop().continue_()
-    expect(page.locator(".desk-said")).to_contain_text("crossing 1 of 3, 0.50 to 0.80 s")
+    expect(page.locator(".desk-message")).to_contain_text("crossing 1 of 3, 0.50 to 0.80 s")
     page.unroute("**/crossings")
     listed = page.locator(".desk-doubts li")
     expect(listed).to_have_count(2)
     assert "<b>walk</b> or pause?" in listed.nth(1).inner_text()  # names are text
     page.keyboard.press("n")
-    expect(page.locator(".desk-said")).to_contain_text("0.50 to 1.00 s: walk or run?")
+    expect(page.locator(".desk-message")).to_contain_text("0.50 to 1.00 s: walk or run?")
     expect(page.locator(".desk-clock")).to_contain_text("0.7")
     page.keyboard.press("k")
-    expect(page.locator(".desk-said")).to_contain_text("4.00 to 4.50 s")
+    expect(page.locator(".desk-message")).to_contain_text("4.00 to 4.50 s")
     expect(page.locator(".desk-side h3 .muted")).to_have_text("1 of 2 left")
     opened(served, page, 0.0)
     expect(page.locator(".desk-side h3 .muted")).to_have_text("1 of 2 left")
     page.keyboard.press("n")
-    expect(page.locator(".desk-said")).to_contain_text("4.00 to 4.50 s")
+    expect(page.locator(".desk-message")).to_contain_text("4.00 to 4.50 s")
     page.keyboard.press("k")
-    expect(page.locator(".desk-said")).to_contain_text("all places in doubt have been looked at")
-    side, said = page.locator(".desk-side"), page.locator(".desk-said")
+    expect(page.locator(".desk-message")).to_contain_text("all places in doubt have been reviewed")
+    side, said = page.locator(".desk-side"), page.locator(".desk-message")
     expect(side.locator(".desk-crossings")).to_have_text("3 in all")
     page.keyboard.press("x")
     expect(said).to_contain_text("from the beginning again: crossing 1 of 3, 0.50 to 0.80 s")

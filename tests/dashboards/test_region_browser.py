@@ -61,7 +61,7 @@ def test_a_region_is_drawn_by_clicks_and_keys_over_the_scene_and_saved_as_a_run_
     page.locator("#region-corners").fill("10,10 90,60 90,10 10,60")
     save.focus()
     save.click()
-    expect(page.locator(".region-said.is-wrong")).to_contain_text("sides 1 and 3 of its polygon")
+    expect(page.locator(".region-message.is-wrong")).to_contain_text("sides 1 and 3 of its polygon")
     assert_saved_by_nobody_else(served, page)
     assert len(watched.complaints) == 1  # the browser's own, of an answer 400
     watched.complaints.clear()
@@ -85,7 +85,7 @@ def test_a_region_is_drawn_by_clicks_and_keys_over_the_scene_and_saved_as_a_run_
     np.testing.assert_allclose(corners(page), drawn, atol=0.3)
     line = page.locator("#region-command").inner_text()
     save.click()
-    expect(page.locator(".region-said")).to_contain_text("walker.plan.toml states this region")
+    expect(page.locator(".region-message")).to_contain_text("walker.plan.toml states this region")
     file = served.study / "walker.plan.toml"
     region = Plan.load(file).arena.region
     assert region is not None
@@ -116,7 +116,7 @@ def assert_saved_by_nobody_else(served: Served, page: Page) -> None:
     """Neither without the page's own request nor by a form of another site."""
     address = f"{served.address}/region/{KEY}/save"
     form = page.request.post(address, form={"place": "beside"})
-    assert (form.status, form.json()["said"]) == (400, "no region is saved here")
+    assert (form.status, form.json()["message"]) == (400, "no region is saved here")
     asked = {"place": "beside", "corners": CORNERS, "was": None}
     foreign = {"Origin": "http://elsewhere.example"}
     assert page.request.post(address, data=asked, headers=foreign).status == 403

@@ -166,4 +166,4 @@ def test_a_recording_that_was_not_measured_is_seen_whole_and_gets_a_region(study
     )
     about = stated.about(KEY, None)
     assert about["region"] is None
-    assert "millimetres on the floor" in about["said"]
+    assert "millimetres on the floor" in about["message"]

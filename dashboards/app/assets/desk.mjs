@@ -10,7 +10,7 @@ import { Source, json } from "./desk_source.mjs";
 import { Stage } from "./desk_stage.mjs";
 import { Strip } from "./desk_strip.mjs";
 
-const TOLD_MS = 160;  // delay before the page's other figures follow the moment
+const FOLLOW_MS = 160;  // delay before the page's other figures follow the moment
 
 const WHOLE = [0, 0, 1 << 16, 1 << 16];  // clipped to the image
 
@@ -30,7 +30,7 @@ export async function start(key, at, page) {  // the desk; it calls page.moment 
 export function drawn(row, joint, scale = false) {  // a joint's position on the canvas, CSS pixels; or canvas pixels per image pixel
   const { stage } = open, dots = stage.canvas.width / stage.canvas.getBoundingClientRect().width;
   if (scale) return stage.view.scale / dots;
-  const seen = stage.source.at(row), uv = seen && seen.animals[0].uv;
+  const data = stage.source.at(row), uv = data && data.animals[0].uv;
   return uv && stage.at(...uv[joint]).map((one) => one / dots);
 }
 
@@ -68,7 +68,7 @@ class Desk {
     this.stage.onDrag = (dragged) => this.tryJoint(dragged);
     this.stage.onPick = (pixel) => this.clerk.addPixel(pixel);
     this.player.shown = (row) => this.show(row);
-    this.player.stopped = () => this.tell();
+    this.player.stopped = () => this.follow();
     this.strips.forEach((strip) => {
       strip.duration = about.duration_s;
       strip.colours = new Map(about.actions.map((one) => [one.word, one.colour]));
@@ -80,14 +80,14 @@ class Desk {
     this.player.go(this.source.rowAt(at));
     this.readBouts().then(() => this.doubts.read()).then(() => about.may_correct && this.clerk.ask())
       .then(() => this.crossings.read())
-      .catch((error) => this.say(error.message, true));
+      .catch((error) => this.notify(error.message, true));
     await this.stage.first;
   }
 
   build() {
     const may = this.about.may_correct;
     this.canvas = make("canvas", { class: "desk-stage", tabindex: "0", role: "img",
-      "aria-label": "depth picture as height above the floor, with the skeleton; keys are listed beside it" });
+      "aria-label": "depth image as height above the floor, with the skeleton; keys are listed beside it" });
     this.playButton = button("▶ Play", "space", () => this.player.play(!this.player.playing), { class: "main desk-play" });
     this.speed = make("select", { "aria-label": "speed of playing", onchange: (event) => {
       this.player.speed = Number(event.target.value);
@@ -99,9 +99,9 @@ class Desk {
     const bar = make("div", { class: "desk-bar" }, this.playButton, this.speed,
       button("−", "zoom out (−)", () => { this.stage.zoom(0.8); this.player.wake(); }, { "aria-label": "zoom out" }),
       button("+", "zoom in (+)", () => { this.stage.zoom(1.25); this.player.wake(); }, { "aria-label": "zoom in" }),
-      this.viewButton = button("Whole picture", "Z", () => this.view()), this.clock);
+      this.viewButton = button("Whole image", "Z", () => this.view()), this.clock);
     this.now = make("p", { class: "desk-now" });
-    this.said = make("p", { class: "desk-said", role: "status" });
+    this.message = make("p", { class: "desk-message", role: "status" });
     this.names = make("div", { class: "desk-actions", role: "group", "aria-label": "name the bout, or the marked span" },
       ...this.actions.map((one, k) => {
         const swatch = make("i", {});
@@ -117,10 +117,10 @@ class Desk {
       button("Take back", "U", () => this.clerk.undo(), { disabled: !may }),
       button("Redo", "R", () => this.clerk.redo(), { disabled: !may }));
     const side = make("div", { class: "desk-side" }, this.now,
-      make("h3", {}, "What it does"), this.names, deeds, this.said, this.clerk.told,
+      make("h3", {}, "What it does"), this.names, deeds, this.message, this.clerk.status,
       ...this.doubts.parts, ...this.crossings.parts,
       make("details", { class: "desk-keys" }, make("summary", {}, "Keys and mouse"),
-        make("p", { class: "muted" }, "Drag a joint to put it elsewhere; drag the picture to move it. Drag over the upper band to mark a span."),
+        make("p", { class: "muted" }, "Drag a joint to put it elsewhere; drag the image to move it. Drag over the upper band to mark a span."),
         make("dl", {}, ...KEYS.flatMap(([name, does]) => [make("dt", {}, make("kbd", {}, name)), make("dd", {}, does)]))));
     this.place.replaceChildren(make("div", { class: "desk-left" }, this.canvas, bar, ...bands), side);
     this.place.addEventListener("click", (event) => {  // after a click the page gets the keys again
@@ -141,31 +141,31 @@ class Desk {
     this.playButton.textContent = this.player.playing ? "❚❚ Pause" : "▶ Play";
     if (Number(this.speed.value) !== this.player.speed) this.speed.value = String(this.player.speed);
     this.clock.textContent = `${time.toFixed(3)} s of ${this.about.duration_s.toFixed(1)} s`;
-    const seen = this.source.at(row), bout = this.boutAt(time);
+    const data = this.source.at(row), bout = this.boutAt(time);
     const facts = [bout ? bout.action.replaceAll("_", " ") : "unlabelled"];
-    if (seen && seen.flag) facts.push(seen.flag.replaceAll("_", " "));
-    if (seen && seen.error !== null) facts.push(`error ${seen.error.toFixed(1)} mm`);
-    if (seen) facts.push(`frame ${seen.frame}`);
+    if (data && data.flag) facts.push(data.flag.replaceAll("_", " "));
+    if (data && data.error !== null) facts.push(`error ${data.error.toFixed(1)} mm`);
+    if (data) facts.push(`frame ${data.frame}`);
     this.now.textContent = facts.join(" · ");
     [...this.names.children].forEach((one) => one.classList.toggle("is-now", Boolean(bout) && bout.action === one.dataset.word));
-    if (!this.player.playing) this.tell();
+    if (!this.player.playing) this.follow();
   }
 
-  tell() {  // the page's other figures follow, once the moment is steady
-    clearTimeout(this.telling);
-    this.telling = setTimeout(() => {
+  follow() {  // the page's other figures follow, once the moment is steady
+    clearTimeout(this.following);
+    this.following = setTimeout(() => {
       if (this.player.playing || this.player.closed) return;
       this.heard = Number(this.time().toFixed(4));
       this.page.moment(this.heard);
-    }, TOLD_MS);
+    }, FOLLOW_MS);
   }
 
   moment(at) {  // another moment was selected elsewhere on the page
     if (!this.player) return;
     if (this.heard !== undefined && Math.abs(at - this.heard) < 1e-6) return;
-    clearTimeout(this.telling);
+    clearTimeout(this.following);
     this.player.play(false);
-    clearTimeout(this.telling);
+    clearTimeout(this.following);
     this.player.go(this.source.rowAt(at));
   }
 
@@ -184,7 +184,7 @@ class Desk {
 
   view() {
     if (this.stage.follow) this.stage.whole(); else this.stage.fit();
-    this.viewButton.textContent = this.stage.follow ? "Whole picture" : "Go with the animal";
+    this.viewButton.textContent = this.stage.follow ? "Whole image" : "Go with the animal";
     this.player.wake();
   }
 
@@ -198,22 +198,22 @@ class Desk {
   markSpan(from, to) {
     this.span = [from, to];
     this.strips.forEach((strip) => { strip.span = this.span; strip.paint(); });
-    if (from !== null && to !== null) this.say(`marked ${from.toFixed(2)} to ${to.toFixed(2)} s`);
-    else if (from !== null || to !== null) this.say(`marked ${from !== null ? `from ${from.toFixed(2)}` : `to ${to.toFixed(2)}`} s`);
+    if (from !== null && to !== null) this.notify(`marked ${from.toFixed(2)} to ${to.toFixed(2)} s`);
+    else if (from !== null || to !== null) this.notify(`marked ${from !== null ? `from ${from.toFixed(2)}` : `to ${to.toFixed(2)}`} s`);
   }
 
   async name(word) {
     const [from, to] = this.span, time = this.time();
     if (from !== null && to !== null) return this.clerk.correct(`add ${quoted(word)} ${from.toFixed(4)} ${to.toFixed(4)}`);
     if (this.boutAt(time)) return this.clerk.correct(`rename ${time} ${quoted(word)}`);
-    this.say(`nothing is named at ${time.toFixed(2)} s; mark the span with [ and ], then press the number`, true);
+    this.notify(`nothing is named at ${time.toFixed(2)} s; mark the span with [ and ], then press the number`, true);
     return null;
   }
 
   number(k) {
     const action = this.actions[k];
     if (action) return this.name(action.word);
-    this.say("no action has this key");
+    this.notify("no action has this key");
     return null;
   }
 
@@ -225,8 +225,8 @@ class Desk {
   }
 
   moved(row, joint, to) {  // in words
-    const seen = this.source.at(row);
-    return `joint ${quoted(this.about.joints[joint])} ${seen.frame} ${to[0].toFixed(3)} ${to[1].toFixed(3)}`;
+    const data = this.source.at(row);
+    return `joint ${quoted(this.about.joints[joint])} ${data.frame} ${to[0].toFixed(3)} ${to[1].toFixed(3)}`;
   }
 
   placeJoint(row, joint, to) {
@@ -243,12 +243,12 @@ class Desk {
       const sentence = this.moved(dragged.row, dragged.joint, dragged.asked);
       dragged.asked = null;
       try {
-        const told = await this.clerk.post({ sentence, try: true });
-        dragged.said = `z ${told.z_mm.toFixed(1)} mm${told.note ? ", height kept" : ""}`;
-        if (this.stage.dragged === dragged) this.say(told.said);
+        const answer = await this.clerk.post({ sentence, try: true });
+        dragged.label = `z ${answer.z_mm.toFixed(1)} mm${answer.note ? ", height kept" : ""}`;
+        if (this.stage.dragged === dragged) this.notify(answer.message);
       } catch (error) {
-        dragged.said = "not here";
-        if (this.stage.dragged === dragged) this.say(error.message, true);
+        dragged.label = "not here";
+        if (this.stage.dragged === dragged) this.notify(error.message, true);
       }
       this.stage.changed();
     }
@@ -259,12 +259,12 @@ class Desk {
     this.crossings.forget();
     await Promise.all([this.source.forgetRows(), this.readBouts()]);
     this.player.wake();
-    this.doubts.read().then(() => this.crossings.read()).catch((error) => this.say(error.message, true));
+    this.doubts.read().then(() => this.crossings.read()).catch((error) => this.notify(error.message, true));
   }
 
-  say(text, wrong = false) {
-    this.said.textContent = text;
-    this.said.classList.toggle("is-wrong", wrong);
+  notify(text, wrong = false) {
+    this.message.textContent = text;
+    this.message.classList.toggle("is-wrong", wrong);
   }
 
   key_(event) {

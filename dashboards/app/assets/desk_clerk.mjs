@@ -12,7 +12,7 @@ export class Clerk {
     this.tickets = [];
     this.mine = [];  // corrections of this visit, which U undoes
     this.unsaved = 0;
-    this.told = make("p", { class: "muted desk-saved", role: "status" });
+    this.status = make("p", { class: "muted desk-saved", role: "status" });
     this.list = document.getElementById("correct-made");  // absent if nothing may be corrected
     this.sentence = document.getElementById("correct-sentence");
     if (!this.sentence) return;
@@ -33,16 +33,16 @@ export class Clerk {
     const { here } = desk.doubts;
     let taken = false;
     try {
-      const told = await this.post({ sentence });
+      const answer = await this.post({ sentence });
       taken = true;
-      this.tickets.push({ ticket: told.ticket, placed });
-      this.mine.push({ ticket: told.ticket });
-      desk.say(told.said);
+      this.tickets.push({ ticket: answer.ticket, placed });
+      this.mine.push({ ticket: answer.ticket });
+      desk.notify(answer.message);
       desk.markSpan(null, null);
       desk.doubts.corrected(here, desk.time());
     } catch (error) {
       if (placed) desk.stage.placed.delete(placed);
-      desk.say(error.message, true);
+      desk.notify(error.message, true);
       desk.player.wake();
     }
     this.soon();
@@ -52,30 +52,30 @@ export class Clerk {
   async undo() {
     const { desk } = this, last = this.mine.pop();
     if (last === undefined) {
-      desk.say("nothing of this visit is left to take back; the list of corrections below has those of before");
+      desk.notify("nothing of this visit is left to take back; the list of corrections below has those of before");
       return;
     }
     await this.change("taking back …", { undo: true, ...last });
   }
 
   async redo() {  // the correction that was last undone, in this visit or before
-    const told = await this.change("making again …", { redo: true });
-    if (told) this.mine.push({ number: told.number });
+    const answer = await this.change("making again …", { redo: true });
+    if (answer) this.mine.push({ number: answer.number });
   }
 
   async change(doing, asked) {
     const { desk } = this;
-    let told = null;
-    desk.say(doing);
+    let answer = null;
+    desk.notify(doing);
     try {
-      told = await this.post(asked);
-      this.tickets.push({ ticket: told.ticket });
-      desk.say(told.said);
+      answer = await this.post(asked);
+      this.tickets.push({ ticket: answer.ticket });
+      desk.notify(answer.message);
     } catch (error) {
-      desk.say(error.message, true);
+      desk.notify(error.message, true);
     }
     this.soon();
-    return told;
+    return answer;
   }
 
   post(asked) {
@@ -86,9 +86,9 @@ export class Clerk {
 
   soon() {
     this.unsaved = Math.max(this.unsaved, 1);
-    this.told.textContent = "saving …";
+    this.status.textContent = "saving …";
     clearTimeout(this.asking);
-    this.asking = setTimeout(() => this.ask().catch((error) => this.desk.say(error.message, true)), ASK_MS);
+    this.asking = setTimeout(() => this.ask().catch((error) => this.desk.notify(error.message, true)), ASK_MS);
   }
 
   async ask() {  // state of the corrections
@@ -100,16 +100,16 @@ export class Clerk {
     this.show(state);
     this.reported ||= state.report_old;
     const report = state.report_old ? "; writing the report …" : this.reported ? "; the report is up to date" : "";
-    this.told.textContent = state.unsaved ? `saving ${state.unsaved} …`
+    this.status.textContent = state.unsaved ? `saving ${state.unsaved} …`
       : `${n === 1 ? "1 correction stands" : `${n} corrections stand`}, all saved${report}`;
-    const failed = done.map((one) => state.tickets[one.ticket]).find((one) => one && one.state === "failed" && !one.said.startsWith("taken back"));
-    if (failed) desk.say(failed.said, true);
+    const failed = done.map((one) => state.tickets[one.ticket]).find((one) => one && one.state === "failed" && !one.message.startsWith("taken back"));
+    if (failed) desk.notify(failed.message, true);
     if (done.length) {
       await desk.refresh();
       done.forEach((one) => one.placed && desk.stage.placed.delete(one.placed));
       desk.player.wake();
       desk.page.corrected();
-      if (state.notes.length && !failed) desk.say(state.notes[state.notes.length - 1], true);
+      if (state.notes.length && !failed) desk.notify(state.notes[state.notes.length - 1], true);
     }
     if (this.tickets.length || state.unsaved) this.soon();
     else if (state.report_old) this.asking = setTimeout(() => this.ask().catch(() => {}), REPORT_MS);
@@ -118,7 +118,7 @@ export class Clerk {
   show({ log, redo }) {  // the corrections in effect, each with a button that undoes it
     if (!this.list) return;
     const back = (number) => button("Take back", "", () => this.change("taking back …", { undo: true, number }));
-    const lines = log.map((one) => make("li", {}, `${one.number}: ${one.said} (${one.author}, ${one.made_at}) `, back(one.number)));
+    const lines = log.map((one) => make("li", {}, `${one.number}: ${one.message} (${one.author}, ${one.made_at}) `, back(one.number)));
     this.list.replaceChildren(log.length ? make("ul", { class: "made" }, ...lines) : make("p", { class: "muted" }, "No corrections so far."),
       ...(redo ? [button(`Redo: ${redo}`, "", () => this.redo())] : []));
   }

@@ -33,10 +33,10 @@ export class Crossings {
   }
 
   next(way) {
-    if (!this.all) { this.asked = way; this.desk.say("crossings are still being looked for"); return; }
+    if (!this.all) { this.asked = way; this.desk.notify("crossings are still being searched for"); return; }
     const n = this.all.length, time = this.desk.time();
     if (!n) {
-      this.desk.say("there is no crossing: nowhere were head and tail, or the animal and another thing, found to be exchanged or perhaps so");
+      this.desk.notify("there is no crossing: nowhere were head and tail, or the animal and another object, found to be exchanged or perhaps so");
       return;
     }
     const found = way > 0 ? this.all.findIndex((one) => one.start_s > time + NEAR_S)
@@ -48,7 +48,7 @@ export class Crossings {
   go(k, first) {
     const one = this.all[k], several = this.desk.about.animals.length > 1;
     this.desk.stop(one.start_s);
-    this.desk.say(`${first}crossing ${k + 1} of ${this.all.length}, ${one.start_s.toFixed(2)} to ${one.stop_s.toFixed(2)} s`
+    this.desk.notify(`${first}crossing ${k + 1} of ${this.all.length}, ${one.start_s.toFixed(2)} to ${one.stop_s.toFixed(2)} s`
       + `${several ? `, ${one.individual}` : ""}: ${one.why}`);
   }
 }

@@ -9,7 +9,7 @@ export class Doubts {
     this.all = [];
     this.at = -1;
     this.keep = `liex-looked-${desk.key}`;
-    this.looked = new Set(JSON.parse(kept(this.keep) || "[]"));
+    this.reviewed = new Set(JSON.parse(kept(this.keep) || "[]"));
     this.list = make("ol", { class: "desk-doubts" });
     this.count = make("span", { class: "muted" });
     this.parts = [make("h3", {}, "Places in doubt ", this.count),
@@ -32,18 +32,18 @@ export class Doubts {
 
   take(found) {
     const now = this.here;
-    this.all = found.map((one) => ({ ...one, done: this.looked.has(nameOf(one)) }));
+    this.all = found.map((one) => ({ ...one, done: this.reviewed.has(nameOf(one)) }));
     this.at = now ? this.all.findIndex((one) => nameOf(one) === nameOf(now)) : -1;
     this.desk.strips.forEach((strip) => { strip.doubts = this.all; });
     this.list.replaceChildren(...this.all.map((one, k) => {
-      const line = button("", "look at this place", () => this.go(k), { class: "link" });
+      const line = button("", "go to this place", () => this.go(k), { class: "link" });
       line.append(make("b", {}, `${one.start_s.toFixed(2)} s `), one.why);
       return make("li", {}, line);
     }));
-    this.tell();
+    this.update();
   }
 
-  tell() {
+  update() {
     const left = this.all.filter((one) => !one.done).length;
     this.count.textContent = this.all.length ? `${left} of ${this.all.length} left` : "none";
     [...this.list.children].forEach((line, k) => {
@@ -59,24 +59,24 @@ export class Doubts {
     this.at = k;
     const one = this.here;
     this.desk.stop((one.start_s + one.stop_s) / 2);
-    this.desk.say(`${one.start_s.toFixed(2)} to ${one.stop_s.toFixed(2)} s: ${one.why}`);
-    this.tell();
+    this.desk.notify(`${one.start_s.toFixed(2)} to ${one.stop_s.toFixed(2)} s: ${one.why}`);
+    this.update();
   }
 
   next(way) {
     const n = this.all.length, time = this.desk.time();
-    if (!n) { this.desk.say("no place is in doubt"); return; }
+    if (!n) { this.desk.notify("no place is in doubt"); return; }
     const from = this.at >= 0 ? this.at : way > 0 ? this.all.findIndex((one) => one.start_s >= time) - 1
       : this.all.filter((one) => one.stop_s <= time).length;
     for (let k = 1; k <= n; k += 1) {
       const next = (((from + way * k) % n) + n) % n;
       if (!this.all[next].done) { this.go(next); return; }
     }
-    this.desk.say("all places in doubt have been looked at");
+    this.desk.notify("all places in doubt have been reviewed");
   }
 
   right() {
-    if (!this.here) { this.desk.say("go to a place in doubt first, with N"); return; }
+    if (!this.here) { this.desk.notify("go to a place in doubt first, with N"); return; }
     this.done(this.here);
     this.next(1);
   }
@@ -87,9 +87,9 @@ export class Doubts {
 
   done(one) {
     one.done = true;
-    this.looked.add(nameOf(one));
-    kept(this.keep, JSON.stringify([...this.looked]));
-    this.tell();
+    this.reviewed.add(nameOf(one));
+    kept(this.keep, JSON.stringify([...this.reviewed]));
+    this.update();
   }
 }
 

@@ -6,7 +6,7 @@ export const KEYS = [
   ["[ ]", "mark a span from here, to here; Esc clears it"], ["F", "exchange head and tail in the span, or here"],
   ["N P", "next, previous place in doubt"], ["K", "it is right as it is: next"],
   ["X", "next crossing: ends or animals taken for one another; with Shift the one before"], ["U R", "take back; make again what was taken back"],
-  ["+ − Z", "zoom in, out; all of the picture"], ["S", "skeleton on, off"],
+  ["+ − Z", "zoom in, out; all of the image"], ["S", "skeleton on, off"],
 ];
 
 export function typing(event) {  // a key for a field or a list, not for the page
@@ -18,7 +18,7 @@ export function typing(event) {  // a key for a field or a list, not for the pag
 
 export function keyOf(k) { return k < 9 ? String(k + 1) : k < 18 ? `⇧${k - 8}` : ""; }  // of the k-th action
 
-export function actOf(desk, event) {  // the action of a key on the desk; undefined if there is none
+export function actOf(desk, event) {  // the action of a key on the desk; undefined if it has none
   const { player, stage } = desk;
   const seconds = (by) => desk.source.rowAt(desk.time() + by);
   const go = (row) => { player.play(false); player.go(row); };
@@ -34,7 +34,7 @@ export function actOf(desk, event) {  // the action of a key on the desk; undefi
     ArrowUp: () => bout(-1), ArrowDown: () => bout(1),
     ",": () => player.faster(-1), ".": () => player.faster(1),
     "[": () => desk.mark(0), "]": () => desk.mark(1),
-    Escape: () => { stage.cancel(); desk.markSpan(null, null); desk.say(""); },
+    Escape: () => { stage.cancel(); desk.markSpan(null, null); desk.notify(""); },
     f: () => desk.flip(), u: () => desk.clerk.undo(), r: () => desk.clerk.redo(),
     n: () => desk.doubts.next(1), p: () => desk.doubts.next(-1), k: () => desk.doubts.right(),
     x: () => desk.crossings.next(event.shiftKey ? -1 : 1),

@@ -1,27 +1,27 @@
 // The frames of a session or of a clip: images and joints, requested ahead and cached.
 
 const ROWS = 512;  // frames per request of joints
-const PICTURES = 240;  // in the cache
+const IMAGES = 240;  // in the cache
 const AT_ONCE = 4;  // images that are loading
 const STEP = 16;  // boxes begin and end at multiples of this, pixels
 
 export async function json(address, options) {
   const answer = await fetch(address, options);
-  let told;
+  let content;
   try {
-    told = await answer.json();
+    content = await answer.json();
   } catch {
     throw new Error(answer.ok ? "the dashboard's answer cannot be read" : `the dashboard answered ${answer.status}`);
   }
-  if (!answer.ok) throw new Error(told.said || `the dashboard answered ${answer.status}`);
-  return told;
+  if (!answer.ok) throw new Error(content.message || `the dashboard answered ${answer.status}`);
+  return content;
 }
 
 export class Source {
   constructor(base) {
     this.base = base;
     this.chunks = new Map();
-    this.pictures = new Map();
+    this.images = new Map();
     this.wanted = [];
     this.loading = 0;
     this.changed = () => {};
@@ -37,7 +37,7 @@ export class Source {
       this.times = new Float64Array(times);
     });
     [this.about] = await Promise.all([json(`${this.base}/about`), this.timed]);
-    if (this.about.n === undefined) throw new Error(this.about.said);
+    if (this.about.n === undefined) throw new Error(this.about.message);
     return this.about;
   }
 
@@ -96,18 +96,18 @@ export class Source {
     return [left, top, Math.max(1, right - left), Math.max(1, bottom - top)];
   }
 
-  picture(row, box) {  // {image, box} that covers the box; null until loaded
-    const known = this.pictures.get(row);
+  image(row, box) {  // {image, box} that covers the box; null until loaded
+    const known = this.images.get(row);
     if (known && covers(known.box, box)) {
-      this.pictures.delete(row);
-      this.pictures.set(row, known);
+      this.images.delete(row);
+      this.images.set(row, known);
       return known.image.complete && known.image.naturalWidth ? known : null;
     }
     return null;
   }
 
   want(row, box, first = false) {
-    const known = this.pictures.get(row);
+    const known = this.images.get(row);
     if ((known && covers(known.box, box)) || row < 0 || row >= this.times.length) return;
     this.wanted = this.wanted.filter((one) => one.row !== row);
     if (first) this.wanted.unshift({ row, box }); else this.wanted.push({ row, box });
@@ -121,16 +121,16 @@ export class Source {
       const { row, box } = this.wanted.shift();
       const image = new Image();
       const kept = { image, box: [...box] };
-      this.pictures.set(row, kept);
+      this.images.set(row, kept);
       this.loading += 1;
       const done = () => { this.loading -= 1; this.changed(); this.pump(); };
       image.addEventListener("load", () => {  // it was clipped to the image
         kept.box.splice(2, 2, image.naturalWidth, image.naturalHeight);
         done();
       });
-      image.addEventListener("error", () => { if (this.pictures.get(row) === kept) this.pictures.delete(row); done(); });
+      image.addEventListener("error", () => { if (this.images.get(row) === kept) this.images.delete(row); done(); });
       image.src = `${this.base}/frame/${row}.png?box=${box.join(",")}`;
-      while (this.pictures.size > PICTURES) this.pictures.delete(this.pictures.keys().next().value);
+      while (this.images.size > IMAGES) this.images.delete(this.images.keys().next().value);
     }
   }
 }

@@ -24,9 +24,9 @@ export class Stage {
     this.onDrag = () => {};
     this.onPick = () => {};
     this.last = null;
-    this.first = new Promise((seen) => {  // resolves with the first image, or without one
-      this.seen = seen;
-      setTimeout(seen, PATIENCE_MS);
+    this.first = new Promise((resolve) => {  // resolves with the first image, or without one
+      this.resolve = resolve;
+      setTimeout(resolve, PATIENCE_MS);
     });
     this.onPlaceable = () => true;
     canvas.addEventListener("pointerdown", (event) => this.down(event));
@@ -63,7 +63,7 @@ export class Stage {
   wanted(row) {  // the view of a frame
     const { width, height } = this.size(), about = this.source.about;
     const whole = Math.min(width / about.width, height / about.height);
-    const seen = this.source.at(row), middle = seen && seen.animals[0].middle;
+    const data = this.source.at(row), middle = data && data.animals[0].middle;
     const half = about.animals[0].half_px;
     const base = this.follow ? Math.min(width, height) / (2 * half) : whole;
     const scale = Math.min(Math.max(base * this.zoomBy, whole), MOST_ZOOM * (window.devicePixelRatio || 1));
@@ -79,8 +79,8 @@ export class Stage {
   }
 
   ready(row) {
-    const seen = this.source.at(row);
-    return Boolean(seen && this.source.picture(row, this.tight(this.wanted(row))));
+    const data = this.source.at(row);
+    return Boolean(data && this.source.image(row, this.tight(this.wanted(row))));
   }
 
   tight(view) {  // the visible part of the image
@@ -110,10 +110,10 @@ export class Stage {
       scale: this.view.scale * (target.scale / this.view.scale) ** share,
     };
     this.source.want(row, this.boxOf(target), true);
-    const picture = this.source.picture(row, this.tight(target)) || this.source.pictures.get(row);
-    if (picture && picture.image.complete && picture.image.naturalWidth) this.last = { row, ...picture };
+    const cached = this.source.image(row, this.tight(target)) || this.source.images.get(row);
+    if (cached && cached.image.complete && cached.image.naturalWidth) this.last = { row, ...cached };
     this.paint();
-    if (this.last) requestAnimationFrame(() => this.seen());
+    if (this.last) requestAnimationFrame(() => this.resolve());
     return Math.hypot(target.u - this.view.u, target.v - this.view.v) * this.view.scale < 0.3
       && Math.abs(Math.log(target.scale / this.view.scale)) < 1e-3;
   }
@@ -131,7 +131,7 @@ export class Stage {
   }
 
   uvOf(animal) {  // its joints, with the positions set by the user
-    const seen = this.source.at(this.row), uv = seen && seen.animals[animal].uv;
+    const data = this.source.at(this.row), uv = data && data.animals[animal].uv;
     if (!uv || uv.some((one) => one[0] === null)) return null;
     return uv.map((one, j) => this.placed.get(`${this.row}/${j}`)
       || (this.dragged && this.dragged.animal === animal && this.dragged.joint === j ? this.dragged.to : one));
@@ -147,13 +147,13 @@ export class Stage {
       context.imageSmoothingQuality = "high";
       context.drawImage(this.last.image, x, y, w * this.view.scale, h * this.view.scale);
     }
-    const seen = this.source.at(this.row);
-    if (this.skeleton && seen) {
+    const data = this.source.at(this.row);
+    if (this.skeleton && data) {
       let posed = false;
-      seen.animals.forEach((_, animal) => {
+      data.animals.forEach((_, animal) => {
         const uv = this.uvOf(animal);
         posed = posed || uv !== null;
-        if (uv) this.bones(uv, animal, dots, seen.flag === "doubtful");
+        if (uv) this.bones(uv, animal, dots, data.flag === "doubtful");
       });
       if (!posed) this.note("no pose in this frame", dots);
     }
@@ -188,7 +188,7 @@ export class Stage {
       context.lineWidth = 1.2 * dots;
       context.strokeStyle = "#222";
       context.stroke();
-      const where = held && this.dragged.said ? `, ${this.dragged.said}` : "";
+      const where = held && this.dragged.label ? `, ${this.dragged.label}` : "";
       if (held || this.hover === j) this.label(`${about.joints[j]}${where}`, one, dots);
     });
   }

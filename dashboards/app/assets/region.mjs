@@ -32,7 +32,7 @@ class Region {
   }
 
   async begin() {
-    this.place.replaceChildren(make("p", { class: "muted" }, "Reading the picture ..."));
+    this.place.replaceChildren(make("p", { class: "muted" }, "Reading the image ..."));
     this.take(await json(`${this.base}/about`));
     this.build();
     this.show(this.about.region);
@@ -49,7 +49,7 @@ class Region {
     const { width, height } = this.about;
     this.stage = shape("svg", {
       viewBox: `-0.5 -0.5 ${width} ${height}`, class: "region-stage", tabindex: "0", role: "application",
-      "aria-label": "depth picture; arrow keys move a cross, Enter puts a corner, C closes the polygon",
+      "aria-label": "depth image; arrow keys move a cross, Enter puts a corner, C closes the polygon",
     });
     this.image = shape("image", { x: -0.5, y: -0.5, width, height, preserveAspectRatio: "none" });
     this.scene = shape("g", {});
@@ -61,40 +61,40 @@ class Region {
     this.stage.addEventListener("pointercancel", () => { this.held = null; });
     this.stage.addEventListener("keydown", (event) => this.key(event));
     this.at = make("span", { class: "region-at" });
-    this.said = make("p", { class: "region-said", role: "status" });
+    this.message = make("p", { class: "region-message", role: "status" });
     const bar = make("div", { class: "region-bar", role: "toolbar", "aria-label": "the polygon" },
       this.closer = button("Close", "close the polygon (C)", () => this.closeShape()),
       button("Undo", "undo (U)", () => this.undo()),
       button("Clear", "take every corner away", () => this.change({ corners: [], closed: false })),
-      ...this.pictures(), this.at);
+      ...this.imageChoice(), this.at);
     this.side = make("div", {});
     this.place.replaceChildren(make("div", {}, this.stage, bar), this.side);
     this.place.className = "region is-open";
-    this.picture(this.about.measured ? "session" : "recording");
+    this.showImage(this.about.measured ? "session" : "recording");
     this.about.marks.forEach((one) => this.mark(one));
     this.panel();
   }
 
-  pictures() {
+  imageChoice() {
     if (!(this.about.measured && this.about.has_recording)) return [];
-    const chooser = make("select", { "aria-label": "picture", onchange: () => this.picture(chooser.value) },
-      make("option", { value: "session" }, "picture of the session"),
-      make("option", { value: "recording" }, "picture of the whole recording"));
+    const chooser = make("select", { "aria-label": "image", onchange: () => this.showImage(chooser.value) },
+      make("option", { value: "session" }, "image of the session"),
+      make("option", { value: "recording" }, "image of the whole recording"));
     return [chooser];
   }
 
-  picture(of) {
-    const address = `${this.base}/picture.png?of=${of}`;
+  showImage(of) {
+    const address = `${this.base}/image.png?of=${of}`;
     this.image.addEventListener("error", async () => {  // the reason, in words
       const answer = await fetch(address);
-      if (!answer.ok) this.say((await answer.json()).said, true);
+      if (!answer.ok) this.notify((await answer.json()).message, true);
     }, { once: true });
     this.image.setAttribute("href", address);
   }
 
-  mark({ kind, points, said }) {
+  mark({ kind, points, label }) {
     const text = shape("title", {});
-    text.textContent = `${kind} ${said}`.trim();
+    text.textContent = `${kind} ${label}`.trim();
     if (points.length > 1) {
       const line = shape("polygon", { class: "scene-line", points: points.join(" ") });
       line.append(text);
@@ -125,9 +125,9 @@ class Region {
       make("label", { for: "region-corners" }, "Corners x,y in pixels"), this.corners,
       ...(may ? [make("fieldset", {}, make("legend", {}, "It is the region of"), ...places),
         make("div", { class: "region-bar" }, this.saver, this.remover)] : []),
-      this.said, make("h3", {}, "Lines for a plan"), this.lines, make("h3", {}, "Try it first"), this.command,
+      this.message, make("h3", {}, "Lines for a plan"), this.lines, make("h3", {}, "Try it first"), this.command,
       make("details", { class: "desk-keys" }, make("summary", {}, "Mouse and keys"), list));
-    if (this.about.said) this.say(this.about.said, true);
+    if (this.about.message) this.notify(this.about.message, true);
   }
 
   pixel(event) {
@@ -226,13 +226,13 @@ class Region {
   }
 
   closeShape() {
-    if (this.shape.corners.length < 3) { this.say("a polygon has three or more corners", true); return; }
+    if (this.shape.corners.length < 3) { this.notify("a polygon has three or more corners", true); return; }
     if (!this.shape.closed) this.change({ ...this.shape, closed: true });
   }
 
   undo() {
     const before = this.past.pop();
-    if (before === undefined) { this.say("nothing is left to undo"); return; }
+    if (before === undefined) { this.notify("nothing is left to undo"); return; }
     this.shape = JSON.parse(before);
     this.chosen = null;
     this.nudged = null;
@@ -291,7 +291,7 @@ class Region {
     const words = this.corners.value.trim().split(/[\s;]+/).filter((one) => one);
     const corners = words.map((one) => one.split(",").map((part) => (part ? Number(part) : NaN)));
     if (corners.some((one) => one.length !== 2 || !one.every(Number.isFinite))) {
-      this.say("corners are written as x,y with blanks between them, as in 60,40 260,40 260,200", true);
+      this.notify("corners are written as x,y with blanks between them, as in 60,40 260,40 260,200", true);
       return;
     }
     this.change({ corners, closed: corners.length > 2 });
@@ -316,10 +316,10 @@ class Region {
       parts.push(shape("path", { class: "cross", d: `M${u - 2 * r} ${v}H${u + 2 * r}M${u} ${v - 2 * r}V${v + 2 * r}` }));
     }
     this.layer.replaceChildren(...parts);
-    this.tell();
+    this.update();
   }
 
-  tell() {
+  update() {
     const { corners, closed } = this.shape, list = corners.map((one) => one.join(",")).join(" ");
     if (document.activeElement !== this.corners) this.corners.value = list;
     this.lines.textContent = closed ? `[arena]\nregion = [${corners.map((one) => `[${one.join(", ")}]`).join(", ")}]` : "the polygon is not closed";
@@ -334,24 +334,24 @@ class Region {
     const place = this.about.places.find((one) => one.name === this.about.place);
     this.saver.disabled = true;
     try {
-      const told = await json(`${this.base}/save`, {
+      const about = await json(`${this.base}/save`, {
         method: "POST", headers: { "Content-Type": "application/json" },
         body: JSON.stringify({ place: place.name, corners, was: place.stated }),
       });
-      this.take({ ...told, place: place.name });
+      this.take({ ...about, place: place.name });
       this.panel();
       if (corners === null) this.change({ corners: [], closed: false });
       this.paint();
-      this.say(told.saved);
+      this.notify(about.saved);
     } catch (error) {
-      this.say(error.message, true);
+      this.notify(error.message, true);
       this.saver.disabled = !this.shape.closed;
     }
   }
 
-  say(text, wrong = false) {
-    this.said.textContent = text;
-    this.said.classList.toggle("is-wrong", wrong);
+  notify(text, wrong = false) {
+    this.message.textContent = text;
+    this.message.classList.toggle("is-wrong", wrong);
   }
 }
 

@@ -25,20 +25,20 @@ class Review {
     const [name, nameField] = field("Review", { type: "text", required: true, maxlength: "60", value: names[0] || "review", list: "review-names", id: "review-name" });
     const [n, nField] = field("Clips", { type: "number", min: "1", max: "500", value: "20", id: "review-n" });
     const [seed, seedField] = field("Seed", { type: "number", min: "0", value: "0", id: "review-seed" });
-    this.said = make("p", { class: "desk-said is-wrong", role: "alert" }, this.wrong || "");
+    this.message = make("p", { class: "desk-message is-wrong", role: "alert" }, this.wrong || "");
     const form = make("form", { class: "tools", onsubmit: async (event) => {
       event.preventDefault();
       try {
         const asked = { name: name.value, rater: rater.value, n: Number(n.value), seed: Number(seed.value) };
-        const told = await this.post("/reviews", asked);
-        this.name = told.name;
+        const begun = await this.post("/reviews", asked);
+        this.name = begun.name;
         this.rater = rater.value.trim();
         await this.go();
-      } catch (error) { this.said.textContent = error.message; }
+      } catch (error) { this.message.textContent = error.message; }
     } }, raterField, nameField, make("datalist", { id: "review-names" }, ...names.map((one) => make("option", { value: one }))),
       nField, seedField, make("button", { type: "submit", class: "main" }, "Begin, or go on"));
     this.place.replaceChildren(form, make("p", { class: "muted" },
-      names.length ? `Clips and seed are those of a new review; there are: ${names.join(", ")}.` : "There is no review of this study yet."), this.said);
+      names.length ? `Clips and seed are those of a new review; existing ones: ${names.join(", ")}.` : "There is no review of this study yet."), this.message);
   }
 
   get base() { return `/reviews/${encodeURIComponent(this.name)}`; }
@@ -58,7 +58,7 @@ class Review {
   build() {
     this.canvas = make("canvas", { class: "desk-stage", tabindex: "0", role: "img", "aria-label": "clip of an animal, height above the floor" });
     this.count = make("p", { class: "desk-now", role: "status" });
-    this.said = make("p", { class: "desk-said", role: "status" });
+    this.message = make("p", { class: "desk-message", role: "status" });
     const words = [...this.state.words.entries()].map(([k, one]) => {
       const swatch = make("i", {});
       swatch.style.background = one.colour;
@@ -69,12 +69,12 @@ class Review {
     const none = button("", "", () => this.answer(""));
     none.append(make("kbd", {}, "0"), "none of these");
     const side = make("div", { class: "desk-side" }, this.count,
-      make("p", { class: "muted" }, "Name what it does while the picture has a yellow frame."),
+      make("p", { class: "muted" }, "Name what it does while the image has a yellow frame."),
       make("div", { class: "desk-actions", role: "group", "aria-label": "what it does" }, ...words, none),
       make("div", { class: "desk-bar" }, button("Play or pause", "space", () => this.player.play(!this.player.playing)),
         button("Slower", ",", () => this.player.faster(-1)), button("Faster", ".", () => this.player.faster(1)),
         button("Skeleton", "S", () => { this.stage.skeleton = !this.stage.skeleton; this.player.wake(); }),
-        button("Clip before", "U", () => this.back())), this.said);
+        button("Clip before", "U", () => this.back())), this.message);
     this.place.replaceChildren(make("div", { class: "desk" }, make("div", { class: "desk-left" }, this.canvas), side));
     this.place.addEventListener("click", (event) => { if (event.detail && event.target.closest("button")) this.canvas.focus({ preventScroll: true }); });
   }
@@ -108,12 +108,12 @@ class Review {
     try {
       const asked = { rater: this.rater, clip: this.state.order[this.at], word };
       this.state = await this.post(`${this.base}/answer`, asked);
-      this.said.textContent = "";
+      this.message.textContent = "";
       if (this.state.done && this.at + 1 >= this.state.order.length) { this.end(); return; }
       this.at += 1;
       await this.show();
     } catch (error) {
-      this.said.textContent = error.message;
+      this.message.textContent = error.message;
       this.ready = true;
     }
   }
@@ -136,7 +136,7 @@ class Review {
     this.place.replaceChildren(make("h2", {}, `${this.rater} has named all ${this.state.order.length} clips`),
       make("div", { class: "scroll" }, make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody", {}, ...rows))),
       make("p", { class: "muted" }, "Cohen's kappa: 1 where two always agree, 0 where no more than by chance. The clips were drawn so that rare actions occur, "
-        + "each word of the program in turn, so this is not the agreement over all of the time. Raters who are not done are left out."),
+        + "each word of the program in turn, so this is not the agreement over all of the time. Raters with unnamed clips are left out."),
       button("Another rater", "", () => this.ask(), { class: "main" }));
   }
 

@@ -83,9 +83,9 @@ part("copy-command").addEventListener("click", () => navigator.clipboard && navi
 const button = part("open-replay");
 if (button) {
   button.addEventListener("click", async () => {
-    const said = part("replay-said");
+    const message = part("replay-message");
     try {
-      said.textContent = (await json(`/replay/${path}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ at_s: at }) })).said;
-    } catch (error) { said.textContent = error.message; }
+      message.textContent = (await json(`/replay/${path}`, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ at_s: at }) })).message;
+    } catch (error) { message.textContent = error.message; }
   });
 }

@@ -140,7 +140,7 @@ def test_the_page_has_every_table_and_figure_with_a_sentence_and_loads_nothing(m
     assert re.findall(r"<h2>([^<]+)<span>", html) == labels
     sections = dict(zip(labels, html.split("<section ")[1:-1], strict=True))
     for label, section in sections.items():
-        (said,) = re.findall(r'<p class="said">(.+?)</p>', section)
+        (said,) = re.findall(r'<p class="comment">(.+?)</p>', section)
         assert said.endswith(".")
         assert "Same" in said or "drawing" in said or label in ("Fig. 14", "Fig. 15")
         assert ("Not made" in section) == (label in _NOT_MADE), label
