@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from liex_lab.optics.camera import RANGINGS, Camera, Distortion, Water
-from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.rectify import (
     ideal_camera,
@@ -103,7 +103,7 @@ def test_it_is_lazy_and_sliceable() -> None:
     original = recording(BARREL)
     read = original._read
 
-    def count(k: int) -> DepthFrame:
+    def count(k: int) -> NDArray[np.float32]:
         reads.append(k)
         return read(k)
 
