@@ -24,7 +24,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import unwritable_times
 from liex_lab.runtime import processes
 from liex_lab.runtime.durable import inside
-from liex_lab.runtime.progress import Progress, silent, telling_of_compiling
+from liex_lab.runtime.progress import Progress, silent, reporting_compilation
 from liex_lab.scene.zones import masks_apart
 
 from .build import arenas_of, build_recording, stated_corners
@@ -90,7 +90,7 @@ def run_arenas(
     outcomes: dict[str, ArenaOutcome] = {}
     with (
         processes.imported_ahead(*HEAVY),
-        telling_of_compiling(progress) as progress,
+        reporting_compilation(progress) as progress,
         build_recording(recording, first, progress) as opened,
     ):
         if problem := unwritable_times(opened.times_ns):

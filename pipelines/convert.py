@@ -408,7 +408,7 @@ def _region(
             ]
         for share in _WIDER:
             mask = _wider(region, round(share * seen.width))
-            cut = seen.seen_by(seen.camera, _within(mask), {}, lent=True)
+            cut = seen.viewed_by(seen.camera, _within(mask), {}, lent=True)
             try:
                 if _alike(learned, build_tracker(cut, plan)):
                     return mask, []

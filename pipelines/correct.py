@@ -104,7 +104,7 @@ def correct_session(
             if log.described:
                 log = _describe(raw, log, part)
             (part / corrections.LOG).write_text(log.to_json(), encoding="utf-8")
-            durable.put_in_place(part, folder, aside)
+            durable.move_into_place(part, folder, aside)
         finally:
             shutil.rmtree(part, ignore_errors=True)
     if report:

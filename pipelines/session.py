@@ -41,7 +41,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN, unwritable_times
 from liex_lab.runtime import durable, memory, processes
 from liex_lab.runtime.processes import WorkerPool
-from liex_lab.runtime.progress import Progress, silent, telling_of_compiling
+from liex_lab.runtime.progress import Progress, silent, reporting_compilation
 from liex_lab.sessions import (
     Provenance,
     Session,
@@ -315,7 +315,7 @@ def run_session(
         )
     with (
         processes.imported_ahead(*HEAVY),
-        telling_of_compiling(progress) as progress,
+        reporting_compilation(progress) as progress,
         processes.in_background(partial(build_estimator, first)) as estimator,
         build_recording(recording, first, progress) as opened,
     ):

@@ -202,10 +202,10 @@ def ellipsoid(frame, radii, out, start):
         frame: (4, 3) centre, forward, left, up.
         radii: (3,) mm forward, left, up.
         out: (V, 3) mm, out.
-        start: its first row.
+        start: index of its first row in `out`.
 
     Returns:
-        The row behind its last.
+        The index of the first row after it.
     """
     at = start
     for r in range(BLOB_RINGS + 2):
@@ -429,7 +429,7 @@ def _capsule(first, last, first_radius, last_radius, frame, out, start):
     return at
 
 
-# Kernels of forward kinematics (product of exponentials) for many poses, without NumPy's overhead.
+# Forward kinematics of many poses: each joint's rest rotation times exp(angles), parent by parent.
 
 
 @kernel()

@@ -10,14 +10,14 @@ import typer
 
 import liex_lab
 from liex_lab import api
-from liex_lab.cli.options import SessionPath, group_of_verbs, print_table, say
+from liex_lab.cli.options import SessionPath, command_group, print_table, say
 from liex_lab.errors import SessionError
 from liex_lab.runtime.progress import progress_bar
 
 if TYPE_CHECKING:
     from liex_lab.sessions.corrections import Correction
 
-correct = group_of_verbs("Correct a session; corrections are kept in its folder and can be undone.")
+correct = command_group("Correct a session; corrections are kept in its folder and can be undone.")
 
 Author = Annotated[
     str,

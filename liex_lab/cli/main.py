@@ -32,12 +32,12 @@ from liex_lab.cli.options import (
     Settings,
     TopicName,
     WhichPlan,
-    group_of_verbs,
+    command_group,
     load_plan,
     print_table,
     region_setting,
     say,
-    tell_numbers,
+    print_numbers,
     to_json,
 )
 from liex_lab.cli.sessions import (
@@ -66,7 +66,7 @@ _USERS_TO_MEND = {
     errno.ENOTDIR,
 }
 
-app = group_of_verbs(
+app = command_group(
     "Measure animal behaviour in depth recordings: 3D skeletons, a replay and tables.", name="liex"
 )
 app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
@@ -115,7 +115,7 @@ def demo(out: OutFolder = Path()) -> None:
             video = f"video:   {api.export_video(session, progress=progress)}"
         except LiexError as error:  # the session is complete without it
             video = f"note: there is no video, for {error}"
-    raise typer.Exit(_tell_session(session, video))
+    raise typer.Exit(_print_session(session, video))
 
 
 @app.command(rich_help_panel=START)
@@ -174,7 +174,7 @@ def run(
             progress=progress,
         )
     if isinstance(measured, Path):
-        raise typer.Exit(_tell_session(measured))
+        raise typer.Exit(_print_session(measured))
     codes = [0]
     for one in measured:
         say(f"arena {one.name}")
@@ -182,7 +182,7 @@ def run(
             typer.secho(f"liex: {printable(one.error)}", fg=typer.colors.RED, err=True)
             codes.append(one.error.exit_code)
         if one.session is not None:
-            codes.append(_tell_session(one.session))
+            codes.append(_print_session(one.session))
     raise typer.Exit(max(codes))
 
 
@@ -297,7 +297,7 @@ def live(
         result = api.follow_live(
             source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
         )
-    tell_numbers(result, json_file)
+    print_numbers(result, json_file)
     if not result["n_live"]:
         say(
             "no latency: frames that came while background, floor and size were learned were still "
@@ -332,7 +332,7 @@ def info(
             facts |= {f"model {name}: {key}": value for key, value in card.items()}
         else:
             facts[f"model {name}"] = f"sha256 {str(card.get('sha256', 'unknown'))[:16]}"
-    tell_numbers(facts)
+    print_numbers(facts)
     if not everything:
         say("`liex info --all` lists every package and how the models were made")
 
@@ -381,7 +381,7 @@ def _fault(error: Exception) -> NoReturn:
     _fail("this is a fault of liex_lab and not of yours; please report the lines above", FAULT)
 
 
-def _tell_session(session: Path, further: str = "") -> int:
+def _print_session(session: Path, further: str = "") -> int:
     """Print a session's path and result; returns the exit code, 4 if it needs review."""
     from liex_lab.sessions.folder import folder_bytes, megabytes, taken_from
     from liex_lab.sessions.verdict import read_verdict

@@ -15,12 +15,12 @@ from liex_lab.cli.options import (
     RowName,
     SessionPath,
     VariantName,
-    group_of_verbs,
-    keep_numbers,
+    command_group,
+    write_numbers,
     say,
-    tell_numbers,
-    tell_rows,
-    tell_scores,
+    print_numbers,
+    print_rows,
+    print_scores,
 )
 from liex_lab.dashboards.paper.published import DEVIATIONS, HAND
 from liex_lab.errors import LiexError
@@ -112,19 +112,19 @@ def train(
             file = out or Path(f"{Path(animal).stem}.npz")
             made = api.train_model(animal, variant, file, n_images=n_images, **how)
     if animal == "tracking" and particles:
-        tell_numbers(report, json_file or out)
+        print_numbers(report, json_file or out)
         return
     if animal == "actions":
         if json_file is not None:
-            keep_numbers(report, json_file)
-        tell_scores(report)
+            write_numbers(report, json_file)
+        print_scores(report)
     say(f"{what}: {made}")
 
 
 # `liex evaluate`: reproduces every published number.
 
 
-evaluate = group_of_verbs("Measure accuracy and speed; --json FILE saves the numbers.")
+evaluate = command_group("Measure accuracy and speed; --json FILE saves the numbers.")
 Result = dict[str, Any]
 OwnModel = Annotated[
     str | None, typer.Option("--model", metavar="FILE", help="Your own model, .npz.")
@@ -132,7 +132,7 @@ OwnModel = Annotated[
 
 
 def benchmark(
-    name: str, show: Callable[[Result], None] = tell_numbers
+    name: str, show: Callable[[Result], None] = print_numbers
 ) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """Register a function as the command `liex evaluate NAME`; its parameters are the options.
 
@@ -147,7 +147,7 @@ def benchmark(
             with progress_bar() as progress:
                 result = measure(**options, progress=progress)
             if json_file is not None:
-                keep_numbers(result, json_file)
+                write_numbers(result, json_file)
             show(result)
 
         own = inspect.signature(measure, eval_str=True).parameters
@@ -165,14 +165,14 @@ def benchmark(
 def show_poses(result: Result) -> None:
     """Print the numbers of a split; for other-build, a row for each kind of build."""
     if "usual" in result:
-        tell_rows(
+        print_rows(
             {
                 kind: {k: v for k, v in result[kind].items() if not isinstance(v, dict | list)}
                 for kind in ("other", "usual")
             }
         )
     else:
-        tell_numbers(result)
+        print_numbers(result)
 
 
 @benchmark("pose", show_poses)
@@ -394,7 +394,7 @@ def evaluate_tracking(
     )
 
 
-@benchmark("scenes", lambda result: tell_rows(result["rows"]))
+@benchmark("scenes", lambda result: print_rows(result["rows"]))
 def evaluate_scenes(
     only: Annotated[
         str | None, typer.Option("--only", metavar="NAME,...", help="Measure only these scenes.")
@@ -485,7 +485,7 @@ def show_hands(result: Result) -> None:
     """Print one line for each method."""
     from liex_lab.pipelines.evaluation import nyu
 
-    tell_numbers(nyu.in_short(result))
+    print_numbers(nyu.in_short(result))
 
 
 @benchmark("nyu", show_hands)
@@ -510,7 +510,7 @@ def show_motion(result: Result) -> None:
     """Print one measure per row."""
     from liex_lab.pipelines.evaluation import motion
 
-    tell_rows(motion.in_short(result))
+    print_rows(motion.in_short(result))
 
 
 @benchmark("motion", show_motion)

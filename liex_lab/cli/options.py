@@ -66,7 +66,7 @@ def region_setting(region: str | None) -> list[str]:
 
     Args:
         region: "x,y x,y x,y", the corners of a polygon, or "circle x,y radius"; a final word mm
-            means millimetres on the floor instead of pixels.
+            means millimetres on the floor, px (the default) pixels.
 
     Raises:
         PlanError: it is neither.
@@ -87,8 +87,8 @@ def region_setting(region: str | None) -> list[str]:
     if len(corners) < 3 or any(len(corner) != 2 for corner in corners):
         raise PlanError(
             "--region takes three or more corners in pixels, as in --region "
-            "'60,40 260,40 260,200 60,200', or a circle, as in --region 'circle 160,120 90'; a "
-            f"last word mm makes both millimetres on the floor; got '{region}'"
+            "'60,40 260,40 260,200 60,200', or a circle, as in --region 'circle 160,120 90'; add "
+            f"mm at the end to give either in millimetres on the floor; got '{region}'"
         )
     if unit == "px":
         return [f"arena.region={corners}"]
@@ -96,7 +96,7 @@ def region_setting(region: str | None) -> list[str]:
 
 
 def load_plan(plan: str | None, settings: Sequence[str]) -> liex_lab.Plan:
-    """The named plan, or the usual one, with settings: an error in them is raised at once."""
+    """The named plan, or `mouse`, with settings: an error in them is raised at once."""
     return liex_lab.Plan.load(plan or "mouse").with_settings(settings)
 
 
@@ -117,15 +117,15 @@ def print_table(rows: Iterable[Iterable[object]], *headings: str) -> None:
     Console().print(table)
 
 
-def tell_numbers(result: dict[str, Any], json_file: Path | None = None) -> None:
+def print_numbers(result: dict[str, Any], json_file: Path | None = None) -> None:
     """Print numbers as a table, and write them as JSON if a file is given."""
     if json_file is not None:
-        keep_numbers(result, json_file)
+        write_numbers(result, json_file)
     shown = {k: to_json(v) if isinstance(v, dict) else v for k, v in result.items()}
     print_table((k, f"{v:.4g}" if isinstance(v, float) else v) for k, v in shown.items())
 
 
-def tell_rows(rows: dict[str, dict[str, Any]]) -> None:
+def print_rows(rows: dict[str, dict[str, Any]]) -> None:
     """Print rows of results by name as a Markdown table."""
     columns = [*dict.fromkeys(name for row in rows.values() for name in row)]
     lines = [["", *(name.replace("_", " ") for name in columns)], ["---"] * (len(columns) + 1)]
@@ -142,7 +142,7 @@ def _cell(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def keep_numbers(result: dict[str, Any], json_file: Path) -> None:
+def write_numbers(result: dict[str, Any], json_file: Path) -> None:
     """Write the numbers as JSON."""
     json_file.parent.mkdir(parents=True, exist_ok=True)
     json_file.write_text(to_json(result) + "\n", encoding="utf-8")
@@ -155,7 +155,7 @@ def to_json(result: Any) -> str:
     return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False)
 
 
-def tell_scores(report: dict[str, Any]) -> None:
+def print_scores(report: dict[str, Any]) -> None:
     """Print scores of recognised actions (`actions.labels.timeline_scores`).
 
     Args:
@@ -235,7 +235,7 @@ class SectionedGroup(TyperGroup):
                     formatter.write_dl(rows, col_max=12)
 
 
-def group_of_verbs(help: str, name: str | None = None) -> typer.Typer:
+def command_group(help: str, name: str | None = None) -> typer.Typer:
     """A `typer.Typer` whose help is plain text in sections.
 
     Args:

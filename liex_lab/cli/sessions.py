@@ -499,7 +499,7 @@ def cohort(
         only=only or (),
         dry_run=dry_run,
     )
-    if _tell_study(standings, dry_run):
+    if _print_study(standings, dry_run):
         say(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
         # the exit code of a study in which a session failed
         raise typer.Exit(3)
@@ -562,7 +562,7 @@ def verify(
         raise typer.Exit(1)
 
 
-def _tell_study(standings: list[SessionStatus], all_of_them: bool) -> int:
+def _print_study(standings: list[SessionStatus], all_of_them: bool) -> int:
     """Print sessions that are not done, and the number in each state.
 
     Returns the number of sessions that failed or whose recording is missing.

@@ -167,13 +167,13 @@ def _reader_of(path: Path) -> tuple[tuple[str, str], Path]:
     Raises:
         RecordingError: it is no recording that can be read.
     """
-    from liex_lab.recordings.formats.images.nyu import looks_like_nyu
+    from liex_lab.recordings.formats.images.nyu import is_nyu
 
     if not path.exists():
         raise RecordingError(f"there is no file or folder {path}; check the spelling")
     if path.is_dir():
         return _reader_of_folder(path)
-    if looks_like_nyu(path.parent, [path.name]):
+    if is_nyu(path.parent, [path.name]):
         return ("images.nyu", "open_nyu"), path
     where = _named(path.name)
     if where is None:  # a file of any name may start with MCAP's magic bytes
@@ -194,10 +194,10 @@ def _named(name: str, files: dict[str, tuple[str, str]] = _FILES) -> tuple[str, 
 
 
 def _reader_of_folder(folder: Path) -> tuple[tuple[str, str], Path]:
-    from liex_lab.recordings.formats.images.nyu import looks_like_nyu
+    from liex_lab.recordings.formats.images.nyu import is_nyu
     from liex_lab.recordings.formats.images.raytrix import (
         PROFILE_FILE,
-        looks_like_raytrix,
+        is_raytrix,
         no_profile_error,
     )
 
@@ -208,9 +208,9 @@ def _reader_of_folder(folder: Path) -> tuple[tuple[str, str], Path]:
         return _MOSEQ, folder
     if PROFILE_FILE in inside:
         return ("images.raytrix", "open_raytrix"), folder
-    if CAMERA_FILE not in inside and looks_like_raytrix(folder, inside):
+    if CAMERA_FILE not in inside and is_raytrix(folder, inside):
         raise no_profile_error(folder)
-    if looks_like_nyu(folder, inside):
+    if is_nyu(folder, inside):
         return ("images.nyu", "open_nyu"), folder
     if "session.json" in inside:
         raise RecordingError(

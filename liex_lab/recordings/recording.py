@@ -425,7 +425,7 @@ class Recording:
         cut.region_px = self.region_px
         return cut
 
-    def seen_by(
+    def viewed_by(
         self,
         camera: Camera,
         change: Callable[[Depth], Depth],
@@ -461,7 +461,7 @@ class Recording:
             close=None if lent else self.close,
             faults=self._faults,
             unpacked=self.unpacked,
-            grow=lambda: (more := self.grown()) and more.seen_by(camera, change, optics),
+            grow=lambda: (more := self.grown()) and more.viewed_by(camera, change, optics),
             doubts=self.doubts,
         )
         other._whole = self._whole or self
@@ -482,7 +482,7 @@ class Recording:
             PlanError: the corners are not a polygon in the image.
         """
         inside = region_mask(region_px, self.width, self.height)
-        cut = self.seen_by(
+        cut = self.viewed_by(
             self.camera,
             lambda depth: np.where(inside, depth, np.float32(0)),
             self.optics,
@@ -512,7 +512,7 @@ class Recording:
                     kept[number] = depth
             return depth
 
-        other = self.seen_by(self.camera, lambda depth: depth, self.optics)
+        other = self.viewed_by(self.camera, lambda depth: depth, self.optics)
         other._read = recall
         other.region_px = self.region_px
         return other

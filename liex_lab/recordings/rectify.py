@@ -41,10 +41,11 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
     if camera.distortion is None and water is None:
         return recording
     optics = {
+        **recording.optics,
         "distortion": None if camera.distortion is None else camera.distortion.to_dict(),
         "water": None if water is None else water.to_dict(),
     }
-    view = recording.seen_by(ideal_camera(camera, water), rectifier(camera, water), optics)
+    view = recording.viewed_by(ideal_camera(camera, water), rectifier(camera, water), optics)
     lost = share_lost(camera)
     # share of an image's pixels lost at its edge
     if lost > 0.05:
@@ -58,10 +59,11 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
 def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
     """The recording with left and right exchanged in every image.
 
-    Drivers of some cameras deliver mirrored images; a mirrored left hand is also a right hand.
+    Drivers of some cameras deliver mirrored images. A mirrored image of a left hand cannot be told
+    from an image of a right hand, so this also serves to measure left hands.
 
     Args:
-        recording: depth to be mirrored.
+        recording: rectified depth: a distortion would not be mirrored.
         lent: keep the recording open when the result is closed.
 
     Returns:
@@ -70,7 +72,7 @@ def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
     camera = recording.camera
     turned = replace(camera, cx=camera.width - 1.0 - camera.cx)
     optics = {**recording.optics, "mirrored": True}
-    return recording.seen_by(
+    return recording.viewed_by(
         turned, lambda depth: np.ascontiguousarray(depth[:, ::-1]), optics, lent=lent
     )
 
@@ -176,8 +178,9 @@ def lookup_table(camera: Camera) -> NDArray[np.int32]:
 def pixel_laws(camera: Camera, water: Water) -> NDArray[np.float32]:
     """Refraction law of every pixel's ray, in homogeneous pixels, as required by `kernels.lift`.
 
-    A point of the law (`Water.law`) becomes (u z, v z, z) of the camera `without` the water; three
-    more numbers move it to that higher camera.
+    13 numbers per pixel: the first four of `Water.law`, its two vectors of three in homogeneous
+    pixels (u z, v z, z) of the ideal camera, and the shift of three to that camera, which is higher
+    than the real one by `lift_mm`.
 
     Args:
         camera: a camera without distortion.

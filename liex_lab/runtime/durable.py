@@ -294,7 +294,7 @@ def replacing(path: Path, replace_folder: bool = False) -> Iterator[Path]:
         else:
             sync_file(part)
         if path.is_dir() and replace_folder:
-            put_in_place(part, path, path.with_name(f".{path.name}.old"))
+            move_into_place(part, path, path.with_name(f".{path.name}.old"))
         else:
             part.replace(path)
             sync_folder(path.parent)
@@ -316,7 +316,7 @@ def write_whole(path: Path, text: str) -> None:
         part.write_text(text, encoding="utf-8")
 
 
-def put_in_place(new: Path, place: Path, aside: Path) -> None:
+def move_into_place(new: Path, place: Path, aside: Path) -> None:
     """Rename a folder to its final path; the old one is removed when the new one is safe on disk.
 
     All three paths are in the same parent folder. After a kill at any point, either `place` is
@@ -345,7 +345,7 @@ def put_in_place(new: Path, place: Path, aside: Path) -> None:
 
 
 def put_back(place: Path, aside: Path) -> bool:
-    """Restore the folder that an interrupted `put_in_place` moved aside.
+    """Restore the folder that an interrupted `move_into_place` moved aside.
 
     Args:
         place: the final path.

@@ -63,7 +63,8 @@ def progress_bar() -> Iterator[Progress]:
         last: tuple[int, int | None] = (0, None)
 
         def report(done: int, total: int | None, what: str) -> None:
-            """Show completed and total pieces and the activity; a new total resets the time."""
+            """Show completed and total pieces and the activity; a new total, or a
+            smaller count, starts a new stage and resets the remaining time."""
             nonlocal last
             if total != last[1] or done < last[0]:
                 display.reset(task, total=total)  # a new stage has its own remaining time
@@ -77,7 +78,7 @@ COMPILING = "compiling, once on this machine: a minute or two"
 
 
 @contextmanager
-def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
+def reporting_compilation(progress: Progress) -> Iterator[Progress]:
     """The same progress, which within the block also reports compilations of numba kernels.
 
     After the last compilation, the latest report of the job is repeated.
@@ -91,7 +92,7 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
     from numba.core import event
 
     last: tuple[int, int | None, str] = (0, None, "beginning")
-    under_way = 0
+    n_compiling = 0
 
     def forward(done: int, total: int | None, what: str) -> None:
         """Forward a report, and keep it."""
@@ -99,30 +100,30 @@ def telling_of_compiling(progress: Progress) -> Iterator[Progress]:
         last = (done, total, what)
         progress(done, total, what)
 
-    class Compiles(event.Listener):
+    class CompilationListener(event.Listener):
         """Listener of numba's compilations."""
 
-        def on_start(self, event: object) -> None:
+        def on_start(self, started: object) -> None:
             """Report that a compilation began."""
-            nonlocal under_way
-            under_way += 1
+            nonlocal n_compiling
+            n_compiling += 1
             progress(0, None, COMPILING)
 
-        def on_end(self, event: object) -> None:
+        def on_end(self, ended: object) -> None:
             """A compilation ended: after the last one, repeat the latest report."""
-            nonlocal under_way
-            under_way -= 1
-            if not under_way:
+            nonlocal n_compiling
+            n_compiling -= 1
+            if not n_compiling:
                 progress(*last)
 
-    with event.install_listener("numba:compile", Compiles()):
+    with event.install_listener("numba:compile", CompilationListener()):
         yield forward
 
 
 class Board:
-    """Progress of many concurrent jobs.
+    """Counts the progress of concurrent jobs and prints a line for each finished one.
 
-    Shows a bar for each running job, one for all, and a line for each finished job.
+    `progress_board` draws the bars.
 
     Attributes:
         n_ended: finished jobs.
@@ -146,18 +147,18 @@ class Board:
         self._running: dict[str, float] = {}  # job -> completed fraction
         self.n_ended = self.n_failed = 0
 
-    def told(self, name: str, done: int, total: int | None, what: str) -> None:
+    def report(self, name: str, done: int, total: int | None, what: str) -> None:
         """Receive a progress report of one job.
 
         Args:
             name: the job.
             done: completed pieces.
             total: total pieces; None if unknown.
-            what: the current activity.
+            what: not shown; accepted as in any progress report.
         """
         self._running[name] = min(done / total, 1.0) if total else self._running.get(name, 0.0)
 
-    def ended(self, name: str, sentence: str, failed: bool) -> None:
+    def finish(self, name: str, sentence: str, failed: bool) -> None:
         """Count a finished job and print a line with the time left.
 
         Args:
@@ -185,7 +186,7 @@ class Board:
         return spent * (1.0 - share) / share if share > 0 else None
 
     @property
-    def lines(self) -> list[tuple[str, float]]:
+    def running_shares(self) -> list[tuple[str, float]]:
         """Name and completed fraction (0 to 1) of each running job, sorted by name."""
         return sorted(self._running.items())
 
@@ -219,7 +220,7 @@ def progress_board(n_jobs: int) -> Iterator[Board]:
 
     def draw() -> Table:
         grid = Table.grid(padding=(0, 2))
-        for name, share in [*board.lines, ("all", board.share)]:
+        for name, share in [*board.running_shares, ("all", board.share)]:
             filled = round(30 * share)
             grid.add_row(
                 Text(printable(name)),

@@ -412,7 +412,7 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     sd = np.concatenate([spread[:, 0], turned("sd_t{}_mm")[:, 0]], axis=1)
     covariance = track.cov_root  # NaN beside the diagonal for an older session
     covariance[:, range(6), range(6)] = sd**2
-    above, below = np.triu_indices(6, 1)
+    rows, columns = np.triu_indices(6, 1)
     pairs = _columns(rotations.iloc[:: j + 1], list(tables.ROOT_COVARIANCES))
     covariance[:, above, below] = covariance[:, below, above] = pairs
     for name in (

@@ -450,7 +450,7 @@ class SessionWriter:
         if made is not None:  # they apply again if the poses are the same
             shutil.copytree(durable.unlinked_tree(made), copy)
             durable.sync_tree(copy)
-        durable.put_in_place(self._folder, self.path, aside_folder(self.path))
+        durable.move_into_place(self._folder, self.path, aside_folder(self.path))
         self._done = True
         self._stop_logging()
         self._checkpoint.tidy(self.path)

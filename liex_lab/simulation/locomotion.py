@@ -58,12 +58,10 @@ _STRETCHES = {
     _HUNCH: (1, 1.0, 3.0, (0.0, 0.0)),
     _REACH: (2, 0.4, 1.2, (0.0, 0.4)),
 }
-_BLEND_S = 0.12  # time constant of the blend between postures
+_BLEND_S = 0.12  # standard deviation of the Gaussian blend between postures
 
-# durations of beating, and of gliding or resting in between
 _GLIDE_S = 0.35  # time constant of a glide's speed
-_LENGTHS_S = (1.0, 5.0)  # speed that a bout reaches
-# share of bouts that begin with a turn, which lasts _TURN_S
+_BOUT_SPEED = (1.0, 5.0)  # that a bout reaches, body lengths/s
 _BEND_PER_TURN = 0.55  # degrees per joint for each rad/s of turning
 
 
@@ -207,7 +205,7 @@ def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
 def _flow(
     rng: np.random.Generator, skeleton: Skeleton, shape: BodyShape, kinds: NDArray[np.int64]
 ) -> Posture:
-    """One posture per stretch, with slow changes within it, blended into the next."""
+    """Postures, redrawn when the kind changes and about every 25 frames, blended."""
     drawn = draw_postures(rng, skeleton, kinds, shape)
     n = len(kinds)
     change = np.concatenate([[True], (kinds[1:] != kinds[:-1]) | (rng.random(n - 1) < 0.04)])
@@ -280,8 +278,8 @@ def _steered(
         run: (n,) length of each step, mm.
         pitch: (n,) rad.
         heights: lowest and highest position above the floor, mm.
-        turn: turn of a step, rad, by its number, the nearness of obstacles, 0 to 1, and the
-            direction of `home` to the left, rad, at most 1.
+        turn: function of a step's number, the nearness of obstacles (0 to 1) and the bearing of
+            `home` (rad, left positive, at most 1) that gives the change of heading, rad.
 
     Returns:
         Positions (n, 3) mm, arena frame, and headings (n,) rad.
@@ -391,7 +389,7 @@ def _swim_script(
     at = 0
     pace = 0.0
     while at < n:
-        reached = rng.uniform(*_LENGTHS_S)
+        reached = rng.uniform(*_BOUT_SPEED)
         beats = rng.uniform(4.0, 9.0)
         beating, resting = (
             max(2, int(rng.uniform(*span) / step_s)) for span in ((0.15, 0.6), (0.1, 1.2))
@@ -399,7 +397,7 @@ def _swim_script(
         stop = min(at + beating, n)
         pace = max(reached, pace)
         speed[at:stop] = pace
-        amplitude[at:stop] = rng.uniform(1.5, 5.0) * np.sqrt(pace / _LENGTHS_S[1])
+        amplitude[at:stop] = rng.uniform(1.5, 5.0) * np.sqrt(pace / _BOUT_SPEED[1])
         rate[at:stop] = beats
         # share of bouts that begin with a turn
         if rng.random() < 0.35:

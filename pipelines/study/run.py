@@ -300,7 +300,7 @@ def _look(
 def _ended(shown: Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
     """Show that the work on a session ended: a sentence, or the failure that ended it."""
     sentence = done if isinstance(done, str) else f"{failed}: {done['reason']}"
-    shown.ended(id, sentence, failed=not isinstance(done, str))
+    shown.finish(id, sentence, failed=not isinstance(done, str))
 
 
 def _measure(

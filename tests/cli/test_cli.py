@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 import liex_lab
 from liex_lab import api, cli
-from liex_lab.cli.options import tell_scores
+from liex_lab.cli.options import print_scores
 from liex_lab.errors import MisfitError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.sessions.verdict import Verdict
@@ -382,14 +382,14 @@ def test_info_tells_versions_and_plans_and_prints_a_plan_to_copy() -> None:
 
 def test_scores_of_a_trained_recogniser_are_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     go = {"f1": 0.5, "precision": 0.25, "recall": 1.0, "segment_f1_50": 0.5, "bouts": 7}
-    tell_scores({"animals": 2, "macro_f1": 0.5, "segment_f1_50": 0.5, "per_action": {"go": go}})
+    print_scores({"animals": 2, "macro_f1": 0.5, "segment_f1_50": 0.5, "per_action": {"go": go}})
     told = capsys.readouterr().out
     assert "macro F1 of the frames 0.50" in told
     (row,) = [line for line in told.splitlines() if "go" in line]
     assert [cell.strip() for cell in row.split("│")[1:-1]] == ["go", "7", "0.50", "25%", "100%"]
-    tell_scores({"animals": 1, "note": "one animal only"})
+    print_scores({"animals": 1, "note": "one animal only"})
     assert capsys.readouterr().out == "animals: 1\nnote: one animal only\n"
-    tell_scores({})
+    print_scores({})
     assert capsys.readouterr().out == ""
 
 

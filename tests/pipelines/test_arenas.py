@@ -131,7 +131,7 @@ def test_an_arena_without_an_animal_stops_no_other(tmp_path):
     def emptied(depth: Depth) -> Depth:
         return np.where(still > 0, still, depth)
 
-    seen = recording().seen_by(made.camera, emptied, {})
+    seen = recording().viewed_by(made.camera, emptied, {})
     left, empty = measure_all(seen, plan, tmp_path)
     assert left.session is not None
     assert empty.session is None

@@ -34,7 +34,7 @@ def read(folder: Path) -> str:
 def test_everything_is_on_disk_before_the_old_one_goes(tmp_path: Path) -> None:
     place = fill(tmp_path / "place", "old")
     with recorded() as calls:
-        durable.put_in_place(fill(tmp_path / "new", "new"), place, tmp_path / "aside")
+        durable.move_into_place(fill(tmp_path / "new", "new"), place, tmp_path / "aside")
     check_order(calls, place)
     assert read(place) == "new"
     assert list(tmp_path.iterdir()) == [place]
@@ -49,11 +49,11 @@ def test_killed_at_any_call_one_of_them_is_whole_and_the_next_one_resumes(
         here = tmp_path / str(n)
         place, aside = fill(here / "place", "old"), here / "aside"
         new = fill(here / "new", "new")
-        stopped = killed_at(n, lambda: durable.put_in_place(new, place, aside))  # noqa: B023
+        stopped = killed_at(n, lambda: durable.move_into_place(new, place, aside))  # noqa: B023
         durable.put_back(place, aside)
         assert read(place) in ("old", "new"), n
         shutil.rmtree(new, ignore_errors=True)
-        durable.put_in_place(fill(new, "third"), place, aside)
+        durable.move_into_place(fill(new, "third"), place, aside)
         assert read(place) == "third"
         assert list(here.iterdir()) == [place], n
         if not stopped:
@@ -75,7 +75,7 @@ def test_what_cannot_be_renamed_leaves_the_old_one_in_its_place(
 
     monkeypatch.setattr(os, "rename", refuse)
     with pytest.raises(OSError, match="refused"):
-        durable.put_in_place(new, place, tmp_path / "aside")
+        durable.move_into_place(new, place, tmp_path / "aside")
     assert read(place) == "old"
     assert not (tmp_path / "aside").exists()
 
@@ -88,9 +88,9 @@ def test_a_share_that_cannot_synchronise_is_no_error_and_a_broken_disk_is(
         place, new = fill(tmp_path / "place", "old"), fill(tmp_path / "new", "new")
         if told:
             with pytest.raises(OSError, match="refused"):
-                durable.put_in_place(new, place, tmp_path / "aside")
+                durable.move_into_place(new, place, tmp_path / "aside")
         else:
-            durable.put_in_place(new, place, tmp_path / "aside")
+            durable.move_into_place(new, place, tmp_path / "aside")
         assert read(place) == ("old" if told else "new")
 
 

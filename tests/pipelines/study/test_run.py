@@ -411,12 +411,12 @@ def test_a_board_says_how_long_it_will_take() -> None:
     lines: list[str] = []
     now = [0.0]
     board = Board(4, lines.append, lambda: now[0])
-    board.told("a", 5, 10, "measuring")
+    board.report("a", 5, 10, "measuring")
     now[0] = 10.0
     assert board.share == pytest.approx(1 / 8)
     assert board.left_s == pytest.approx(70.0)
-    board.ended("a", "is done", failed=False)
+    board.finish("a", "is done", failed=False)
     assert lines == ["1 of 4: a is done, about 30 s left"]
     for name in "bcd":
-        board.ended(name, "failed", failed=True)
+        board.finish(name, "failed", failed=True)
     assert (board.n_failed, board.share, lines[-1]) == (3, 1.0, "4 of 4: d failed")

@@ -53,7 +53,7 @@ class NyuJoints:
     xyz: NDArray[np.float64]
 
 
-def looks_like_nyu(folder: Path, names: list[str]) -> bool:
+def is_nyu(folder: Path, names: list[str]) -> bool:
     """Whether files are those of the NYU data set: names match, and one of the first eight is in
     colour.
 

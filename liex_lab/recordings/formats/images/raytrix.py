@@ -64,7 +64,7 @@ class Profile(BaseModel):
         pattern: which files of the folder to read.
         kind: metric (depth maps), virtual (relative depth) or points (point clouds).
         stored: type of the stored values, float32 or uint16.
-        unit_mm: mm per stored step.
+        unit_mm: mm per stored step; for virtual depth, a factor on the converted mm.
         offset_mm: added after scaling, mm.
         sign: -1 if object space is on the negative side of the file's z axis.
         invalid: stored values that mean "no reading" (z of points).
@@ -295,15 +295,13 @@ def open_raytrix(
     return recording
 
 
-def looks_like_raytrix(folder: Path, names: list[str]) -> bool:
-    """Whether a file's name is that of an export, or it is a point cloud or the vendor's
-    calibration.
+def is_raytrix(folder: Path, names: list[str]) -> bool:
+    """Whether a folder holds a Raytrix export, a point cloud or the vendor's calibration.
 
     Args:
-        folder: their folder.
+        folder: the folder.
         names: names of the files in it.
     """
-    # names of exports
     return any(
         fnmatch(name.lower(), pattern)
         for name in names
@@ -321,7 +319,7 @@ def no_profile_error(folder: Path) -> RecordingError:
     """The error for a folder of exports without a raytrix.toml."""
     listed = ", ".join(shipped_profiles())
     return RecordingError(
-        f"{folder} holds exports of a Raytrix camera, whose numbers mean depth in several ways; "
+        f"{folder} seems to hold exports of a Raytrix camera, whose numbers mean depth in several ways; "
         f"write a {PROFILE_FILE} "
         f'into it with a line such as profile = "raytrix-f32-negative-mm" (one of {listed}), and '
         "a camera.toml"
@@ -400,15 +398,15 @@ def _open_clouds(
     ]
     if not files:
         raise RecordingError(
-            f"no point cloud (.xyz, .txt, .csv or .ply) in {folder} fits pattern = "
+            f"no point cloud ({', '.join(_CLOUD_SUFFIXES)}) in {folder} fits pattern = "
             f"{profile.pattern!r} of {PROFILE_FILE}; correct it"
         )
     width = stated.width if isinstance(stated, Camera) else camera_toml.width
     height = stated.height if isinstance(stated, Camera) else camera_toml.height
     if not (width and height):
         raise RecordingError(
-            f"a point cloud has no pixels, so state the camera that shall see those in {folder}: "
-            "write a camera.toml with fx, fy, cx, cy, width and height in pixels"
+            f"point clouds have no pixels; describe the camera onto which those in {folder} are "
+            "projected: write a camera.toml with fx, fy, cx, cy, width and height in pixels"
         )
     camera = camera_toml.camera(width, height, stated)
     scale = profile.unit_mm * np.array([1.0, -1.0 if profile.up else 1.0, float(profile.sign)])
