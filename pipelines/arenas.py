@@ -24,7 +24,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import unwritable_times
 from liex_lab.runtime import processes
 from liex_lab.runtime.durable import inside
-from liex_lab.runtime.progress import Progress, silent, reporting_compilation
+from liex_lab.runtime.progress import Progress, reporting_compilation, silent
 from liex_lab.scene.zones import masks_apart
 
 from .build import arenas_of, build_recording, stated_corners

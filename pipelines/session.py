@@ -41,7 +41,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN, unwritable_times
 from liex_lab.runtime import durable, memory, processes
 from liex_lab.runtime.processes import WorkerPool
-from liex_lab.runtime.progress import Progress, silent, reporting_compilation
+from liex_lab.runtime.progress import Progress, reporting_compilation, silent
 from liex_lab.sessions import (
     Provenance,
     Session,
@@ -591,7 +591,7 @@ def measure_behaviour(
     recogniser = build_recogniser(plan, origin.skeleton)
     rules = build_rules(plan)
     around = replace(build_surroundings(origin), seams=seams)
-    moved = summary.moving_rows(rows, rules, around, allocate)
+    moved = summary.kinematics_of_rows(rows, rules, around, allocate)
     named: dict[str, Any] = {}
     notes: dict[str, Any] = {}
     if recogniser is not None:

@@ -2,9 +2,10 @@
 
 A track of any frame rate becomes channels of one rate, so that a recogniser gets the same features
 from any camera: a faster camera is averaged over each tick, a slower one interpolated linearly.
-Channels: velocity along and across the heading, yaw rate, pitch, straightness, bends of three parts
-of the chain and their rates, height above the floor, nearness of a wall, predicted error. Rates are
-central differences of values smoothed by the binomial filter (1/4, 1/2, 1/4).
+Channels: velocity along and across the heading and upwards, speed, yaw rate, pitch of the trunk
+(`climb`), straightness, length, bends and pitches of three parts of the chain and their rates,
+speed of deformation (`twist`), height above the floor, nearness of a wall, predicted error. Rates
+are central differences of values smoothed by the binomial filter (1/4, 1/2, 1/4).
 
 Frames whose trunk points against those within 0.15 s to either side are left out (head and tail
 were exchanged). Gaps up to 0.4 s are bridged; longer ones split the track into segments.
@@ -121,8 +122,9 @@ def _forward(skeleton: Skeleton) -> tuple[int, int]:
     """The joints (from, to) that define the forward direction of the trunk."""
     way = 1 if skeleton.offsets[1:, 0].sum() > 0 else -1
     # the trunk's share of the chain, for a base at the rear or front
-    end = max(1, round({1: 0.75, -1: 0.4}[way] * (skeleton.n_joints - 1)))
-    return (0, end) if way > 0 else (end, 0)
+    share = 0.75 if way > 0 else 0.4
+    trunk_end = max(1, round(share * (skeleton.n_joints - 1)))
+    return (0, trunk_end) if way > 0 else (trunk_end, 0)
 
 
 def _reversed(track: Track, good: NDArray[np.int64], time_s: Array) -> NDArray[np.bool_]:
@@ -235,21 +237,21 @@ def _stretch(
 
     units_mm: the animal's length and the median error.
     """
-    found = _OnClock(track, rows, time_s, wall, clock)
+    resampled = _OnClock(track, rows, time_s, wall, clock)
     m = len(clock)
     heading = np.empty(m)
     steep = np.empty(m, np.bool_)
     for piece in blocks(m, _PIECE):
-        heading[piece], steep[piece] = _direction(track.skeleton, found.at(piece)[0])
+        heading[piece], steep[piece] = _direction(track.skeleton, resampled.at(piece)[0])
     heading = np.unwrap(heading)
-    # an upright body has no heading: it keeps the last one
+    # an upright body has no heading: it keeps the last one, if there was one
     heading = heading[np.maximum.accumulate(np.where(steep, 0, np.arange(m)))]
     values = allocate((m, len(channel_names(track.skeleton))), np.float64)
     step = clock[1] - clock[0]
     for piece in blocks(m, _PIECE):
         # a channel depends on two ticks to either side
         around = slice(max(0, piece.start - 2), min(m, piece.stop + 2))
-        channels = _channels(track.skeleton, units_mm, step, heading[around], *found.at(around))
+        channels = _channels(track.skeleton, units_mm, step, heading[around], *resampled.at(around))
         values[piece] = channels[piece.start - around.start : piece.stop - around.start]
     return Segment(clock, values)
 
@@ -307,7 +309,7 @@ def _channels(
         columns += [pitch, _rate(_softened(pitch), step)]
     own = (joints - joints.mean(axis=1, keepdims=True)) / length_mm
     twist = _rate(_softened(own.reshape(len(own), -1)), step)
-    # mean speed of the joints relative to the body's middle
+    # root-mean-square speed of the joints relative to their centroid
     columns.append(np.sqrt((twist**2).mean(axis=1) * 3.0))
     if _stands(skeleton):
         z = joints[..., 2] / length_mm
@@ -338,7 +340,10 @@ def _rate(rows: Array, step: float) -> Array:
 
 
 def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float32]:
-    """Features of every tick of a segment: its channels now, and their mean and spread around it.
+    """Features of every tick of a segment: its channels now, and statistics of windows around it.
+
+    Mean and standard deviation in centred windows, mean and root mean square in windows before and
+    after, and the largest absolute value nearby.
 
     For channels that change sign under reflection (their names end in ~), the absolute values of
     the means are used, and the signed means in the centred windows only.

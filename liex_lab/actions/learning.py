@@ -37,10 +37,10 @@ Array = NDArray[np.float64]
 _HIDDEN = 64
 _EPOCHS = 10
 _BATCH = 512
-# for few labels
+# with few labels, train for more epochs: up to about so many steps, at most so many epochs
 _LEAST_STEPS = 1500
 _MOST_EPOCHS = 200
-# quantiles of the speeds of a word, and of its bouts' peak speeds
+# quantiles that bound a word's usual speed
 _USUAL = (0.005, 0.99)
 _FAST = 1.0  # lengths per second, mean of a bout of a fast action
 _NEVER = -30.0  # the logit of a word without training data
@@ -62,7 +62,7 @@ def learn(
         definitions: word -> definition, stored in the model.
         sequences: single cut-out actions: they train the networks, not the order and length of
             actions.
-        progress: reports three steps.
+        progress: reports the stages.
 
     Returns:
         The model, without a card.
@@ -150,7 +150,6 @@ def train_network(examples: Examples, n_words: int, seed: int) -> Network:
     Returns:
         The network, float32, with the standardisation of its features.
     """
-    # to train on; more are subsampled
     step = max(1, -(-len(examples.code) // 120_000))
     rows = np.arange(seed % step, len(examples.code), step)
     features = examples.features[rows]
@@ -232,21 +231,22 @@ def with_card(model: TimelineModel, **facts: Any) -> TimelineModel:
 # Active learning by uncertainty sampling: which segments of a recording to label next.
 
 
-_STEP = 0.5  # between the starts of windows, of their length
+_STEP = 0.5  # between the starts of two windows, as a fraction of a window's length
 
 
 def doubtful_segments(
-    found: Recognised, times_ns: NDArray[np.int64], n: int, least_s: float
+    found: Recognised, times_ns: NDArray[np.int64], n: int, window_s: float
 ) -> list[dict[str, Any]]:
-    """The least certain segments, the first of every pair of confused words before any second.
+    """The least certain segments, in turns over the pairs of words that are confused.
 
-    Windows start every half of their length; selected windows do not overlap.
+    The best segment of each pair comes first, then the second best. Windows start every half of
+    their length; selected windows do not overlap.
 
     Args:
         found: the result of recognising the recording.
         times_ns: (n,) timestamps.
         n: the maximum number of segments.
-        least_s: length of a segment, s.
+        window_s: length of a segment, s.
 
     Returns:
         At most n dicts of start_s, stop_s, uncertainty (mean entropy of the words' probabilities
@@ -256,9 +256,9 @@ def doubtful_segments(
     known = np.isfinite(found.probability[:, 0])
     entropy = np.where(known, -(p * np.log(p)).sum(axis=1) / np.log(p.shape[1]), 0.0)
     time_s = (times_ns - times_ns[:1]) * 1e-9
-    starts = np.arange(0.0, max(time_s[-1] - least_s, 0.0) + 1e-9, _STEP * least_s)
+    starts = np.arange(0.0, max(time_s[-1] - window_s, 0.0) + 1e-9, _STEP * window_s)
     low = np.searchsorted(time_s, starts)
-    high = np.searchsorted(time_s, starts + least_s)
+    high = np.searchsorted(time_s, starts + window_s)
     total = np.concatenate([[0.0], np.cumsum(entropy)])
     mean = (total[high] - total[low]) / np.maximum(high - low, 1)
     taken = np.zeros(len(time_s), bool)
@@ -275,7 +275,7 @@ def doubtful_segments(
         pairs[pair] = pairs.get(pair, 0) + 1
         row = {
             "start_s": float(time_s[a]),
-            "stop_s": float(starts[k] + least_s),
+            "stop_s": float(starts[k] + window_s),
             "uncertainty": float(mean[k]),
             "guess": found.words[first] or "unlabelled",
             "or_else": found.words[second] or "unlabelled",

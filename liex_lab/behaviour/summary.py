@@ -92,13 +92,13 @@ def moving(
     around: Surroundings,
     allocate: Allocator = np.empty,
 ) -> pd.DataFrame:
-    """The table `kinematics` with the thresholds and the water of a session.
+    """The table `kinematics`, computed with a session's thresholds and surroundings.
 
     Args:
         frames: the table `frames`.
         poses: the table `poses` of these frames, or its joints.
         rules: window of the speed, and the impossible speed.
-        around: the water's surface, and the seams.
+        around: the water's surface, and the seams: ends of flips corrected by hand.
         allocate: makes the arrays of the table (an allocator, as `np.empty`).
     """
     return kinematics(
@@ -177,7 +177,7 @@ def measure_rows(
     return measure(rows.frames_table, Joints.of_track(rows.track), rules, around, gaps, **how)
 
 
-def moving_rows(
+def kinematics_of_rows(
     rows: Rows, rules: MouseRules, around: Surroundings, allocate: Allocator = np.empty
 ) -> pd.DataFrame:
     """The table `kinematics` of a track that is not in a session yet, see `moving`.
@@ -185,11 +185,11 @@ def moving_rows(
     Args:
         rows: the track with its frame indices and names.
         rules: window of the speed, and the impossible speed.
-        around: the water's surface.
+        around: the water's surface and the seams.
         allocate: makes the arrays of the table (an allocator, as `np.empty`).
     """
     times_ns = rows.track.times_ns
-    frames = pd.DataFrame(  # only what is needed: the whole table is made once names are known
+    frames = pd.DataFrame(  # only what is needed
         {
             "session_id": rows.session_id,
             "individual": rows.individual,
@@ -261,7 +261,7 @@ def summarise(
     around = around or Surroundings()
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
-    hold = observed_hold(kinematics)
+    hold = observed_hold(kinematics)  # seconds that each observed frame stands for
     first = float(time_s[observed][0]) if observed.any() else np.nan
     block: dict[str, Any] = {
         "session_id": str(frames["session_id"].iloc[0]),
@@ -297,7 +297,7 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
     turning = kinematics["yaw_rate_rad_s"].to_numpy(float)
     turns = np.isfinite(turning)
     turned = float((turning * hold)[turns].sum())
-    either = float((np.abs(turning) * hold)[turns].sum())
+    turned_abs = float((np.abs(turning) * hold)[turns].sum())
     turn_s = float(hold[turns].sum())
     return {
         "distance_m": distance / 1000.0,
@@ -305,8 +305,8 @@ def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:
         "median_speed_mm_s": _median(kinematics["speed_mm_s"]),
         "max_speed_mm_s": float(speed[known].max()) if known.any() else np.nan,
         "speed_noise_mm_s": _median(kinematics["speed_sd_mm_s"]),
-        "mean_abs_yaw_rate_rad_s": either / turn_s if turn_s > 0 else np.nan,
-        "turn_bias": turned / either if either > 0 else np.nan,
+        "mean_abs_yaw_rate_rad_s": turned_abs / turn_s if turn_s > 0 else np.nan,
+        "turn_bias": turned / turned_abs if turned_abs > 0 else np.nan,
     }
 
 
@@ -314,7 +314,7 @@ def _budget(
     kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], first_s: float
 ) -> dict[str, float]:
     """Time, number and latency of each action, and the unlabelled time."""
-    spent = time_named(kinematics, bouts, words)[0]
+    spent = time_named(kinematics, bouts, words)[0]  # s: unlabelled first, then each word
     observed_s = float(spent.sum())
     share = spent / observed_s if observed_s > 0 else np.full(len(spent), np.nan)
     found: dict[str, float] = {}

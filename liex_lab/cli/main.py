@@ -34,10 +34,10 @@ from liex_lab.cli.options import (
     WhichPlan,
     command_group,
     load_plan,
+    print_numbers,
     print_table,
     region_setting,
     say,
-    print_numbers,
     to_json,
 )
 from liex_lab.cli.sessions import (

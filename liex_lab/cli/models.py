@@ -16,11 +16,11 @@ from liex_lab.cli.options import (
     SessionPath,
     VariantName,
     command_group,
-    write_numbers,
-    say,
     print_numbers,
     print_rows,
     print_scores,
+    say,
+    write_numbers,
 )
 from liex_lab.dashboards.paper.published import DEVIATIONS, HAND
 from liex_lab.errors import LiexError

@@ -64,7 +64,8 @@ def progress_bar() -> Iterator[Progress]:
 
         def report(done: int, total: int | None, what: str) -> None:
             """Show completed and total pieces and the activity; a new total, or a
-            smaller count, starts a new stage and resets the remaining time."""
+            smaller count, starts a new stage and resets the remaining time.
+            """
             nonlocal last
             if total != last[1] or done < last[0]:
                 display.reset(task, total=total)  # a new stage has its own remaining time

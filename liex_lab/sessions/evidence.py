@@ -26,7 +26,7 @@ from liex_lab.sessions.provenance import Provenance, package_version, reading_fr
 from liex_lab.sessions.session import Session, spreads
 from liex_lab.sessions.verdict import WHO
 from liex_lab.tables import schema as tables
-from liex_lab.tables.rows import LOST, Rows, median_step, stop_times
+from liex_lab.tables.rows import NOT_FROM_CAMERA, Rows, median_step, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Flip, Subject, Track
 
@@ -308,7 +308,7 @@ def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
 def _camera_gaps(session: Session) -> list[Gap]:
     """Frames that the camera did not deliver and moved timestamps, from the table `gaps`."""
     times, index = (session.frames[name].to_numpy() for name in ("time_ns", "frame_index"))
-    lost_by_camera = session.gaps[~session.gaps["reason"].isin(LOST)]
+    lost_by_camera = session.gaps[~session.gaps["reason"].isin(NOT_FROM_CAMERA)]
     found = []
     for row in lost_by_camera.to_dict("records"):
         at = int(times[np.searchsorted(index, row["start_frame"])])
@@ -410,11 +410,11 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
     track.root_rotation[posed] = so3.exp(turns[posed, 0])
     track.root_mm[:] = turned("t{}_mm")[:, 0]
     sd = np.concatenate([spread[:, 0], turned("sd_t{}_mm")[:, 0]], axis=1)
-    covariance = track.cov_root  # NaN beside the diagonal for an older session
+    covariance = track.cov_root  # NaN off the diagonal for an older session
     covariance[:, range(6), range(6)] = sd**2
     rows, columns = np.triu_indices(6, 1)
     pairs = _columns(rotations.iloc[:: j + 1], list(tables.ROOT_COVARIANCES))
-    covariance[:, above, below] = covariance[:, below, above] = pairs
+    covariance[:, rows, columns] = covariance[:, columns, rows] = pairs
     for name in (
         "scale",
         "predicted_error_mm",

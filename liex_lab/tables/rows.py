@@ -41,7 +41,12 @@ _Found = tuple[float, float, int, int, int, str, float, float]
 _SPAN_NAMES = ("start_s", "stop_s", "start_frame", "stop_frame")
 _NOWHERE = (float("nan"), float("nan"))
 HIDDEN = "hidden"
-LOST = ("no_depth", "repeated", HIDDEN, "tracker_lost")  # reasons of gaps not caused by the camera
+NOT_FROM_CAMERA = (
+    "no_depth",
+    "repeated",
+    HIDDEN,
+    "tracker_lost",
+)  # reasons of gaps not caused by the camera
 _NEAR = 0.1  # radius of a joint's score, as a share of the spine
 
 
@@ -201,7 +206,9 @@ class Rows:
         count = frame_count(self.frame_index)
         found = self._camera_gaps()
         observed = self.track.observed
-        flag = np.where(np.isin(self.track.flag, LOST), self.track.flag, LOST[-1])
+        flag = np.where(
+            np.isin(self.track.flag, NOT_FROM_CAMERA), self.track.flag, NOT_FROM_CAMERA[-1]
+        )
         lost = np.where(observed, "", flag)
         observed_rows = np.flatnonzero(observed)
         stops = stop_times(time)

@@ -83,7 +83,14 @@ def test_short_pauses_are_bridged_before_short_bouts_are_dropped():
     mask = np.zeros(40, bool)
     mask[[0, 1, 4, 5, 10, 20, 21, 22]] = True  # 0-0.2, 0.4-0.6 | 1.0-1.1 | 2.0-2.3
     bouts = list(
-        tidy(mask, np.ones(40, bool), np.zeros(40, np.int64), time, stop_times(time), MouseRules())
+        tidy(
+            mask,
+            np.ones(40, bool),
+            np.zeros(40, np.int64),
+            time,
+            stop_times(time),
+            MouseRules(),
+        )
     )
     assert bouts == [(0, 6), (20, 23)]
     taken = np.ones(40, bool)

@@ -291,7 +291,7 @@ class HandFrameContents(Rows):
         body: (n, B, 3) meshes of torso, head and another object, mm.
         objects: (n, W, 3) meshes of the distractors, mm.
         shown: (n,) bool, whether the distractor is present.
-        wall: (n, 4) planes behind everything and their unevenness, as in `draw_hands`.
+        wall: (n, 4) planes behind the scene and their unevenness, as in `kernels.draw_hands`.
         parameters: (n, N_PARAMETERS) of the sensors.
         seeds: (n,) uint64 of their noise.
         faces: (F, 3) int32, triangles of the hands' meshes.
@@ -335,15 +335,13 @@ class HandFrameContents(Rows):
         return out
 
 
-def hold_out(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pose:
+def pose_hands(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pose:
     """Poses of hands at given points, oriented relative to the lines of sight.
 
     Args:
-        rng: not used.
-        skeleton: not used.
         angles: (n, J, 3) joint angles, rad.
         turns: (n, 3, 3) T_view_palm, in the view along the line of sight to the palm.
-        size: (n,) over home size.
+        size: (n,) relative to the skeleton's home size.
         p_camera: (n, 3) of the palms, mm, camera frame.
 
     Returns:
@@ -608,14 +606,14 @@ class HandSimulator:
     def protocol(self) -> str:
         """One sentence on the test splits, for reports of results."""
         how = (
-            "each of another person's right hand before an NYU camera; the hand and its size are "
-            "found by the product, nothing is handed over; flips are told by the direction from "
-            "the palm to the wrist. "
+            "each recording shows another person's right hand in front of an NYU camera (another "
+            "camera in other-camera); the software finds the hand and its size itself; flips are "
+            "detected by the direction from the palm to the wrist. "
         )
         as_trained = (
-            "as part of the training pictures are"
+            "as for a part of the training images"
             if self.reference is None
-            else "a person after whom no training picture is drawn"
+            else "a person not used for the training images"
         )
         return f"{how}Postures: {self.test_postures}, {as_trained}. "
 
@@ -664,7 +662,7 @@ class HandSimulator:
             low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind]
             angles, turns = draw_wide(rng, skeleton, BLOCK)
             places = draw_places(rng, intrinsics, size_px.astype(float), low, high)
-            pose = hold_out(angles, turns, size, places)
+            pose = pose_hands(angles, turns, size, places)
             contents = assemble(
                 rng, skeleton, pose, shape, size, intrinsics, parameters, 0.15, PER_SESSION
             )
@@ -696,7 +694,7 @@ class HandSimulator:
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 40
     ) -> list[HandSession]:
-        """The recordings of a split: 40 of 50 independent frames, each of another person.
+        """The recordings of a split: by default 40 of 50 independent frames, each of another hand.
 
         Args:
             name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
@@ -746,7 +744,7 @@ class HandSimulator:
         contents = assemble(
             rng,
             skeleton,
-            hold_out(angles, turns, size, places),
+            pose_hands(angles, turns, size, places),
             shape,
             size,
             cameras.intrinsics,
@@ -758,7 +756,7 @@ class HandSimulator:
         return HandSession(name, skeleton, sensor, contents)
 
     def _test_hands(self, rng: np.random.Generator, cameras: PatchCamera) -> _Acted:
-        """Independent hands, with postures from the reference (not used in training)."""
+        """Independent hands, with postures of the reference, or of the training without one."""
         n = len(cameras.size)
         if self.reference is None:
             angles, turns = draw_observed(rng, self.skeleton, n)

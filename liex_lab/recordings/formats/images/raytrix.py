@@ -319,8 +319,8 @@ def no_profile_error(folder: Path) -> RecordingError:
     """The error for a folder of exports without a raytrix.toml."""
     listed = ", ".join(shipped_profiles())
     return RecordingError(
-        f"{folder} seems to hold exports of a Raytrix camera, whose numbers mean depth in several ways; "
-        f"write a {PROFILE_FILE} "
+        f"{folder} seems to hold exports of a Raytrix camera, whose numbers mean depth in several "
+        f"ways; write a {PROFILE_FILE} "
         f'into it with a line such as profile = "raytrix-f32-negative-mm" (one of {listed}), and '
         "a camera.toml"
     )

@@ -178,8 +178,7 @@ def stamp_in(head: memoryview) -> int | None:
     Returns:
         The stamp; None if another field is first, as in a message without a stamp.
     """
-    # the largest length in one byte
-    # protobuf's key of field 1, the stamp, length-delimited
+    # protobuf's key: field 1, the stamp, length-delimited; lengths up to 127 take one byte
     if len(head) < 2 or head[0] != (1 << 3 | 2) or head[1] > min(127, len(head) - 2):
         return None
     try:
@@ -194,7 +193,7 @@ def stamp_in(head: memoryview) -> int | None:
 
 # sensor_msgs/PointField: number of a type, and NumPy's name of it without the byte order
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_SECOND_VERSION = 4  # largest alignment of its numbers, bytes
+_XCDR2_ALIGNMENT = 4  # largest alignment of numbers in version 2 of CDR, bytes
 
 
 class _Fields:
@@ -269,7 +268,7 @@ class _CdrFields(_Fields):
                 "06 or 00 07)"
             )
         self.order = "<" if data[1] & 1 else ">"
-        self.largest_step = _SECOND_VERSION if data[1] > 1 else 8
+        self.largest_step = _XCDR2_ALIGNMENT if data[1] > 1 else 8
 
     def header(self) -> tuple[int, str]:
         """The stamp, ns, and the frame's name of a std_msgs/Header without the counter."""
@@ -302,7 +301,7 @@ def _camera_info(fields: _Fields) -> Calibration:
 def _point_cloud2(fields: _Fields) -> PointCloud:
     stamp_ns, frame_id = fields.header()
     height, width = fields.numbers("I", 2)
-    if fields.largest_step == _SECOND_VERSION:  # the list's length in bytes
+    if fields.largest_step == _XCDR2_ALIGNMENT:  # the list's length in bytes
         fields.whole()
     n_fields = fields.whole()
     if n_fields > 256:
@@ -334,7 +333,7 @@ _PARSERS: dict[str, Callable[[_Fields], Message]] = {
     ),
     "sensor_msgs/CameraInfo": _camera_info,
     "sensor_msgs/PointCloud2": _point_cloud2,
-    # 0.001 instead of its float32
+    # six digits, so that the float32 nearest to 0.001 is printed as 0.001
     "std_msgs/Float32": lambda fields: Statement({"value": f"{fields.numbers('f')[0]:.6g}"}),
     "std_msgs/String": _text,
     "diagnostic_msgs/KeyValue": lambda fields: Statement({fields.text(): fields.text()}),
@@ -343,11 +342,11 @@ _LAYOUTS: dict[str, type[_Fields]] = {"ros1": _Fields, "cdr": _CdrFields}
 
 
 def _read_cdr(read: Callable[[_Fields], Message], data: memoryview) -> Message:
-    """A message in CDR; one marked as the second version may have the layout of the first."""
+    """A message in CDR; one marked as version 2 that leaves bytes over is read as version 1."""
     data = unpacked_message(data)
     fields = _CdrFields(data)
     message = read(fields)
-    if fields.largest_step == _SECOND_VERSION <= len(data) - fields.at:
+    if fields.largest_step == _XCDR2_ALIGNMENT <= len(data) - fields.at:
         fields = _CdrFields(data)
         fields.largest_step = 8
         message = read(fields)
@@ -362,7 +361,7 @@ def _header_stamp(layout: type[_Fields], head: memoryview) -> int | None:
         return None
 
 
-# Decoders of images and point clouds in messages to depth, shared by MCAP files and ROS bags.
+# Decoding images and point clouds in messages into depth, for MCAP files and ROS bags.
 
 
 MOST_PIXELS = (
@@ -373,7 +372,7 @@ _ENCODINGS = {
     "16UC1": ("u2", 1.0),
     "mono16": ("u2", 1.0),
     "32FC1": ("f4", _METRE),
-}  # stored type, mm per step
+}  # stored type, mm per step (1: the recording's own step counts)
 _CONFIG = struct.Struct(
     "<iff"
 )  # precedes a compressedDepth image: format, and a and b of quantised depth
@@ -392,7 +391,6 @@ def image_size(message: DepthMessage) -> tuple[int, int] | None:
     """
     if isinstance(message, PointCloud):
         n = message.width * message.height
-        # points
         known = {"x", "y", "z"} <= message.columns.keys() and 0 < n <= (1 << 22)
         size = (message.width, message.height) if message.height > 1 else (0, 0)
         return size if known else None
