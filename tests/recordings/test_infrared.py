@@ -1,10 +1,8 @@
 """Infrared looks like depth to a reader of 16-bit images: no container lets it pass for depth."""
 
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
@@ -14,25 +12,6 @@ from tests.recordings.video_writers import write_avi, write_mkv
 from tests.recordings.writers import SMALL, depth_frames, even_times, write_png_folder
 
 STORED = depth_frames(6)
-
-
-def write_titled_avi(path: Path, titles: tuple[str, ...]) -> Path:
-    """AVI with a stream for each title; all but the one called DEPTH hold half its values."""
-    with av.open(str(path), "w") as container:
-        streams = [container.add_stream("ffv1", rate=30) for _ in titles]
-        for title, stream in zip(titles, streams, strict=True):
-            stream.width, stream.height = STORED.shape[2], STORED.shape[1]
-            stream.pix_fmt, stream.time_base = "gray16le", Fraction(1, 30)
-            stream.metadata["title"] = title
-        for k, stored in enumerate(STORED):
-            for title, stream in zip(titles, streams, strict=True):
-                values = stored if title == "DEPTH" else stored // 2
-                frame = av.VideoFrame.from_ndarray(values, format="gray16le")
-                frame.pts = k
-                container.mux(stream.encode(frame))
-        for stream in streams:
-            container.mux(stream.encode())
-    return path
 
 
 @pytest.mark.parametrize(
@@ -79,17 +58,14 @@ def test_letters_that_are_no_word_for_infrared_do_not_count(name: str) -> None:
     assert not is_infrared(name)
 
 
-def untitled_mkv(path: Path, stored: np.ndarray) -> Path:
-    return write_mkv(path, 2 * stored, titles=("",))  # the writer halves what is not DEPTH
-
-
-@pytest.mark.parametrize("write", [write_avi, untitled_mkv])
+@pytest.mark.parametrize("write", [write_avi, write_mkv])
 @pytest.mark.parametrize("name", ["ir", "infrared", "mouse_IR"])
 def test_a_video_called_infrared_is_refused_also_alone_in_a_folder(
     tmp_path: Path, name: str, write: Callable[..., Path]
 ) -> None:
     suffix = ".avi" if write is write_avi else ".mkv"
-    path = write(tmp_path / "session" / f"{name}{suffix}", STORED)
+    # the writer halves what is not DEPTH
+    path = write(tmp_path / "session" / f"{name}{suffix}", 2 * STORED, titles=("",))
     for given in (path, path.parent):
         assert "holds infrared" in refusal(given, camera=SMALL)
     for other in ("circle", "first", "birdie"):
@@ -101,7 +77,7 @@ def test_a_video_called_infrared_is_refused_also_alone_in_a_folder(
 def test_a_track_titled_infrared_is_no_depth(tmp_path: Path, title: str) -> None:
     for path in (
         write_mkv(tmp_path / "a.mkv", STORED, titles=(title,)),
-        write_titled_avi(tmp_path / "a.avi", (title,)),
+        write_avi(tmp_path / "a.avi", STORED, titles=(title,)),
     ):
         assert "infrared" in refusal(path, camera=SMALL)
 
@@ -110,7 +86,7 @@ def test_a_track_titled_infrared_is_no_depth(tmp_path: Path, title: str) -> None
 def test_depth_is_taken_wherever_it_stands(tmp_path: Path, titles: tuple[str, ...]) -> None:
     for path in (
         write_mkv(tmp_path / "mouse_ir.mkv", STORED, titles=titles),
-        write_titled_avi(tmp_path / "mouse.avi", titles),
+        write_avi(tmp_path / "mouse.avi", STORED, titles=titles),
     ):
         np.testing.assert_array_equal(depths_in(path, camera=SMALL)[2], STORED[2])
 

@@ -92,6 +92,7 @@ def test_everything_but_the_depth_stays(camera: Camera) -> None:
     if camera is CAMERA:
         assert (seen.width, seen.height) == (160, 120)
     assert seen.camera.distortion is None
+    assert rectified(seen, WATER) is seen, "the water is undone once"
     assert seen.optics == {
         "distortion": camera.distortion and camera.distortion.to_dict(),
         "water": WATER.to_dict(),
@@ -113,11 +114,6 @@ def test_it_is_lazy_and_sliceable() -> None:
     part = seen[2:8:3]
     np.testing.assert_array_equal([f.depth for f in part], [seen.frame(k).depth for k in (2, 5)])
     assert (part.optics, part.digest()) == (seen.optics, original.digest())
-
-
-def test_the_water_is_undone_once() -> None:
-    seen = rectified(recording(), WATER)
-    assert rectified(seen, WATER) is seen
 
 
 def test_closing_closes_the_recording_behind() -> None:

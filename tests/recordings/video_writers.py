@@ -29,19 +29,27 @@ def write_avi(
     gop: int = 12,
     pixels: str = "gray16le",
     level: int = 3,
+    titles: Sequence[str] = ("DEPTH",),
 ) -> Path:
-    """FFV1 in AVI, one key image in `gop`; level 3 has check sums and level 1 none."""
+    """FFV1 in AVI, one key image in `gop`; level 3 has check sums and level 1 none. Streams other
+    than DEPTH hold half its values.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=fps)
-        stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pixels
-        stream.time_base, stream.gop_size = Fraction(1, fps), gop
-        stream.options = {"level": str(level), "slicecrc": str(int(level == 3))}
+        streams = {title: container.add_stream("ffv1", rate=fps) for title in titles}
+        for title, stream in streams.items():
+            stream.width, stream.height, stream.pix_fmt = frames.shape[2], frames.shape[1], pixels
+            stream.time_base, stream.gop_size = Fraction(1, fps), gop
+            stream.options = {"level": str(level), "slicecrc": str(int(level == 3))}
+            stream.metadata["title"] = title
         for k, stored in enumerate(frames):
-            frame = av.VideoFrame.from_ndarray(stored, format=pixels)
-            frame.pts = k
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+            for title, stream in streams.items():
+                values = stored if title == "DEPTH" else stored // 2
+                frame = av.VideoFrame.from_ndarray(values, format=pixels)
+                frame.pts = k
+                container.mux(stream.encode(frame))
+        for stream in streams.values():
+            container.mux(stream.encode())
     return path
 
 

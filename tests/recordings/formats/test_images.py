@@ -19,7 +19,7 @@ from liex_lab.recordings.formats.images.files import read_pclzf_camera
 from liex_lab.recordings.formats.images.folder import natural_key
 from liex_lab.recordings.frame import ENCODINGS, decode
 from tests.oracles import lzf
-from tests.recordings.asking import depths_in, facts_in, refusal
+from tests.recordings.asking import depths_in, exact, facts_in, refusal
 from tests.recordings.picture_writers import pack_lzf, write_folder, write_pclzf, write_pgm
 from tests.recordings.writers import (
     SMALL,
@@ -42,11 +42,8 @@ def test_pictures_are_in_the_order_a_person_would_count_them(tmp_path: Path) -> 
     folder = write_png_folder(tmp_path / "r", STORED)
     (folder / "._frame_3.png").write_bytes(b"resource fork")  # beside them
     (folder / "more").mkdir()
-    with open_recording(folder) as recording:
-        assert len(recording) == 12  # frame_10 comes after frame_9, not after frame_1
-        for frame in recording:
-            np.testing.assert_array_equal(frame.depth, STORED[frame.index])
-        assert recording.problems == []
+    # frame_10 comes after frame_9, not after frame_1
+    assert exact(folder, STORED).problems == []
 
 
 def test_units_and_unread_values_are_as_stated(tmp_path: Path) -> None:
@@ -270,9 +267,7 @@ def test_compressed_tiffs_that_tifffile_leaves_to_others_are_read_too(tmp_path: 
     for k, frame in enumerate(STORED):  # OpenCV writes LZW
         cv2.imwrite(str(folder / f"f{k}.tiff"), frame, [cv2.IMWRITE_TIFF_COMPRESSION, 5])
     write_times(folder, even_times(12))
-    with open_recording(folder) as recording:
-        for frame in recording:
-            np.testing.assert_array_equal(frame.depth, STORED[frame.index])
+    exact(folder, STORED)
 
 
 def test_an_imagej_stack_of_one_page_holds_all_its_pictures(tmp_path: Path) -> None:
@@ -285,9 +280,7 @@ def test_an_imagej_stack_of_one_page_holds_all_its_pictures(tmp_path: Path) -> N
     next_at = page_at + 2 + 12 * n_tags
     content[next_at : next_at + 4] = bytes(4)  # as ImageJ does beyond 4 GB: there is no second page
     path.write_bytes(content)
-    with open_recording(path) as recording:
-        assert len(recording) == 12
-        np.testing.assert_array_equal(recording.frame(11).depth, STORED[11])
+    exact(path, STORED)
 
 
 def test_float_tiffs_are_millimetres_and_may_point_the_other_way(tmp_path: Path) -> None:
@@ -308,11 +301,10 @@ def test_a_cut_tiff_among_whole_ones_is_wholly_unread(tmp_path: Path) -> None:
     cut(folder / "f3.tif", 0.6)
     cut(folder / "f5.tif", 0.0)
     write_times(folder, even_times(12))
-    with open_recording(folder) as recording:
-        assert (len(recording), recording.n_whole, recording.truncated) == (12, 10, True)
-        for frame in recording:
-            expected = np.zeros_like(STORED[0]) if frame.index in (3, 5) else STORED[frame.index]
-            np.testing.assert_array_equal(frame.depth, expected)
+    expected = STORED.copy()
+    expected[[3, 5]] = 0
+    recording = exact(folder, expected)
+    assert (recording.n_whole, recording.truncated) == (10, True)
 
 
 # Images of the rarer kinds: PGM in both byte orders, PCLZF, and the encodings of depth that data
@@ -332,10 +324,9 @@ def test_pgm_is_read_in_the_byte_order_stated_or_plain_to_see(
     folder = write_folder(
         tmp_path / "r", PICTURES_STORED, ".pgm", partial(write_pgm, order=order), **how
     )
-    with open_recording(folder, strict=True) as recording:
-        np.testing.assert_array_equal([frame.depth for frame in recording], PICTURES_STORED)
-        told = any("low byte first" in problem for problem in recording.problems)
-        assert told == (name == "little" and not stated)
+    problems = exact(folder, PICTURES_STORED, strict=True).problems
+    told = any("low byte first" in problem for problem in problems)
+    assert told == (name == "little" and not stated)
 
 
 def test_a_stated_byte_order_is_believed(tmp_path: Path) -> None:

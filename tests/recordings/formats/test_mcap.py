@@ -35,7 +35,7 @@ from liex_lab.recordings.formats.messages.rosbag import BagFile
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.writer import McapDepthWriter
 from liex_lab.runtime.progress import silent
-from tests.recordings.asking import depths_in, opened_or_refused, refusal
+from tests.recordings.asking import depths_in, facts_in, opened_or_refused, refusal
 from tests.recordings.ros_writers import points_of, write_bag, write_messages, write_ros_mcap
 from tests.recordings.writers import (
     SMALL,
@@ -65,11 +65,8 @@ def test_floats_are_metres_and_nan_is_unread(path: Path) -> None:
 
 def test_a_sensor_clock_may_begin_at_zero(path: Path) -> None:
     times = even_times(20, start_ns=0)
-    with open_recording(
-        write_mcap(path, STORED, times_ns=times, log_delay_ns=START_NS)
-    ) as recording:
-        assert recording.times_ns.tolist() == times
-        assert recording.metadata == {}
+    recording = facts_in(write_mcap(path, STORED, times_ns=times, log_delay_ns=START_NS))
+    assert (recording.times_ns.tolist(), recording.metadata) == (times, {})
 
 
 def test_a_picture_of_another_size_is_wholly_unread_and_told(path: Path) -> None:
@@ -93,12 +90,6 @@ def test_a_picture_of_another_size_is_wholly_unread_and_told(path: Path) -> None
         assert not recording.frame(2).depth.any()
         (problem,) = recording.problems
         assert "frame 2" in problem
-
-
-@pytest.mark.parametrize("content", [b"", b"hello", b"\x89MCAP0\r\n"])
-def test_what_is_no_mcap_is_told_in_a_sentence(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
-    assert "r.mcap" in refusal(path)
 
 
 def test_colour_topics_are_not_depth(path: Path) -> None:
