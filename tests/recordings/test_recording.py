@@ -7,12 +7,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import DepthFrame, Recording, open_recording
@@ -34,16 +34,15 @@ N = 7
 STORED = depth_frames(N)
 
 
-def in_memory(
-    n: int = N, times_ns: list[int] | None = None, reads: list[int] | None = None
-) -> Recording:
-    def read(index: int) -> NDArray[np.float32]:
-        if reads is not None:
-            reads.append(index)
-        return np.full((48, 64), float(index), np.float32)
-
-    times = np.array(even_times(n) if times_ns is None else times_ns)
-    return Recording(name="memory", format="synthetic", camera=SMALL, times_ns=times, read=read)
+def in_memory(n: int = N, times_ns: list[int] | None = None, **more: Any) -> Recording:
+    return Recording(
+        name="memory",
+        format="synthetic",
+        camera=SMALL,
+        times_ns=np.array(even_times(n) if times_ns is None else times_ns),
+        read=lambda index: np.full((48, 64), float(index), np.float32),
+        **more,
+    )
 
 
 def test_chunks_hold_every_frame_once() -> None:
@@ -81,15 +80,7 @@ def test_a_short_slice_keeps_the_rate_and_so_sees_its_gap() -> None:
 
 
 def test_a_doubt_is_a_problem_too_and_every_view_shares_it() -> None:
-    times = np.array(even_times(5))
-    recording = Recording(
-        name="memory",
-        format="synthetic",
-        camera=SMALL,
-        times_ns=times,
-        read=lambda index: np.full((48, 64), float(index), np.float32),
-        doubts=["the lens is another one"],
-    )
+    recording = in_memory(5, doubts=["the lens is another one"])
     views = (recording, recording[1:4], recording.remembering(10**6)[::2])
     for view in views:
         assert view.problems == view.doubts == ["the lens is another one"]
