@@ -54,7 +54,7 @@ def listing(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
 
 
-@pytest.mark.parametrize(("source", "target"), zip(SOURCES, TARGETS * 2, strict=True))
+@pytest.mark.parametrize(("source", "target"), list(zip(SOURCES, TARGETS * 2, strict=True)))
 def test_a_recording_is_the_same_in_every_format(tmp_path: Path, source: str, target: str) -> None:
     path = SOURCES[source](tmp_path)
     told: list[tuple[int, int | None, str]] = []
