@@ -485,7 +485,7 @@ def read_document(path: Path) -> dict[str, Any]:
             nul = re.search(r"(?<!\\)(?:\\\\)*\\u0000", text)
             refuse(ValueError, (nul, "it holds a NUL character"))
     except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
-        why = _first(error) if isinstance(error, ValidationError) else str(error)
+        why = first_error(error) if isinstance(error, ValidationError) else str(error)
         raise SessionError(
             f"{path} is damaged and cannot be read ({(why or type(error).__name__)[:200]}); run "
             "`liex run` on the recording again"
@@ -497,7 +497,7 @@ def _no_number(text: str) -> NoReturn:
     raise ValueError(f"it holds {text} for a number")
 
 
-def _first(error: ValidationError) -> str:
+def first_error(error: ValidationError) -> str:
     """The first validation error: where, and what was expected."""
     first = error.errors(include_url=False, include_input=False)[0]
     where = ".".join(str(part) for part in first["loc"])

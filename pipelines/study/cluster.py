@@ -23,6 +23,7 @@ from liex_lab.plan import plans_folder
 from liex_lab.runtime.durable import Scratch
 from liex_lab.runtime.processes import n_cores, worker_environment
 from liex_lab.runtime.text_files import read_toml
+from liex_lab.sessions.provenance import first_error
 
 from .crew import DEATHS, Crew
 
@@ -166,14 +167,11 @@ class SlurmTable(BaseModel):
             )
         try:
             return SlurmTable.model_validate(read_toml(file))
-        except ValidationError as error:  # a subclass of ValueError
-            first = error.errors(include_url=False)[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise StudyError(
-                f"{file}: {where}: {first['msg']}; compare it with the bundled slurm.toml"
-            ) from None
         except ValueError as error:
-            raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
+            why = first_error(error) if isinstance(error, ValidationError) else error
+            raise StudyError(
+                f"{file} should be a TOML file like the bundled slurm.toml, but: {why}; correct it"
+            ) from None
 
 
 # Jobs of a Slurm cluster, requested again if one ends before the study does.
