@@ -307,8 +307,9 @@ def _exchanged_ends(animal: SessionAnimal) -> Iterator[Stretch]:
     if table is None or not len(table):
         return
     table = table.sort_values("start_s")
-    status = np.array([_flip_status(row) for row in records(table)], object)
-    for text, own in table.groupby(status, sort=False):
+    for text, own in table.groupby(
+        np.array([_flip_status(row) for row in records(table)], object), sort=False
+    ):
         spans = own[["start_s", "stop_s"]].to_numpy(float)
         for run in _runs(*spans.T):
             times = f", {len(run)} times" if len(run) > 1 else ""

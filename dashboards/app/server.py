@@ -14,9 +14,9 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlencode, urlsplit
 
 import numpy as np
@@ -40,42 +40,16 @@ from .data import StudyData
 from .desk import Desks, Suggest
 
 
-class Regions(Protocol):
-    """Reads and writes the regions of recordings."""
-
-    @property
-    def of_recordings(self) -> bool:
-        """Whether recordings without results are available."""
-
-    def about(self, key: str, session: Session | None) -> dict[str, Any]:
-        """Facts about the region of the recording `key`, whose results are `session`."""
-
-    def save(
-        self,
-        key: str,
-        session: Session | None,
-        place: str,
-        corners: Sequence[Any] | None,
-        was: Any,
-    ) -> str:
-        """Save a region of `corners` (px) for the recording `key` in `place`; it contained
-        `was`.
-        """
-
-    def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
-        """The usual depth (mm) of every pixel of the recording `key`, and its camera."""
-
-
 class Scenes:
     """Depth images and facts of scenes.
 
     Args:
         data: the study.
         images: the depth images.
-        regions: reads and writes regions; None writes none.
+        regions: reads and writes the regions of recordings, see `make_app`; None writes none.
     """
 
-    def __init__(self, data: StudyData, images: DepthImages, regions: Regions | None) -> None:
+    def __init__(self, data: StudyData, images: DepthImages, regions: Any) -> None:
         self._data = data
         self._images = images
         self._regions = regions
@@ -209,7 +183,7 @@ def make_app(
     report: corrections.Report | None = None,
     suggest: Suggest | None = None,
     reviews: Path | None = None,
-    regions: Regions | None = None,
+    regions: Any = None,
 ) -> Flask:
     """Make the dashboard of a study; `serve` serves it.
 
@@ -225,7 +199,11 @@ def make_app(
             `correct` does.
         suggest: finds the stretches of a session whose actions are least certain; None finds none.
         reviews: folder of blinded reviews, created with the first one; None accepts none.
-        regions: writes the regions of arenas to plans; None writes none.
+        regions: reads and writes the regions of recordings, with `of_recordings`, whether
+            recordings without results are available; `about(key, session)`, facts about a recording's region;
+            `save(key, session, place, corners, was)`, which saves corners (px) in a place that
+            contained `was`; and `picture(key)`, the usual depth (mm) of a recording's pixels and its
+            camera. None writes none.
     """
     app = Flask(
         "liex_lab_dashboard",

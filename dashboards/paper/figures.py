@@ -493,8 +493,11 @@ def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
         panel.imshow(share, cmap="Blues", vmin=0.0, vmax=100.0)
         for row, column in zip(*np.nonzero(counts), strict=True):
             value = share[row, column]
-            colour = "white" if value > 55.0 else "black"
-            where: dict[str, Any] = {"ha": "center", "va": "center", "color": colour}
+            where: dict[str, Any] = {
+                "ha": "center",
+                "va": "center",
+                "color": ("white" if value > 55.0 else "black"),
+            }
             panel.text(column, row, f"{value:.0f}", fontsize=7, **where)
         panel.set_xticks(range(len(words)), words, fontsize=7, **turned)
         panel.set_yticks([])

@@ -409,8 +409,9 @@ class Film(Footage):
         for shade, width in (((0, 0, 0), thick + 2), (colour, thick)):
             for a, b in self.bones:
                 cv2.line(image, fixed[a], fixed[b], shade, width, cv2.LINE_AA, 4)
-        fills = [(255, 255, 255)] * (len(fixed) - 1) + [(238, 102, 119)]
-        for at_px, fill in zip(fixed, fills, strict=True):
+        for at_px, fill in zip(
+            fixed, [(255, 255, 255)] * (len(fixed) - 1) + [(238, 102, 119)], strict=True
+        ):
             cv2.circle(image, at_px, int(16 * 2.0 * size), fill, -1, cv2.LINE_AA, 4)
 
     def _write(

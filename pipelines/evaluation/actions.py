@@ -148,7 +148,7 @@ def evaluate_actions(
             n_train=len(train),
             n_test=len(test),
             seeds=_SEEDS,
-            minutes=_minutes(tracks),
+            minutes=sum(float(np.ptp(one.track.times_ns[[0, -1]])) for one in tracks) / 60e9,
             animals=len(tracks),
             fast=FAST_HZ,
             fast_minutes=sum(one.observations.seconds[-1] for one in fast) / 60.0,
@@ -347,10 +347,6 @@ def one_hour(
         "core_seconds": time.process_time() - worked,
         "cores": float(os.cpu_count() or 1),
     }
-
-
-def _minutes(tracks: Sequence[LabelledTrack]) -> float:
-    return sum(float(one.track.times_ns[-1] - one.track.times_ns[0]) for one in tracks) / 60e9
 
 
 def _scores(recogniser: TimelineModel, tracks: Sequence[LabelledTrack]) -> dict[str, Any]:

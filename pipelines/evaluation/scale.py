@@ -140,8 +140,7 @@ def run_scale(
 
 def _walk(folder: Path, seed: int, n_frames: int) -> Path:
     """A virtual mouse as an MCAP file, which costs as much to read as any recording."""
-    address = _VIRTUAL.format(seed=5 + seed, n=150, sensor="primesense")
-    with open_recording(address) as short:
+    with open_recording(_VIRTUAL.format(seed=5 + seed, n=150, sensor="primesense")) as short:
         return as_mcap(looped(short, n_frames, f"walk{seed}"), folder)
 
 

@@ -426,8 +426,9 @@ def extract(
         for image in (windows.depth, windows.background)
     )
     cut = Patches(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
-    # only ranks the blobs of a window
-    area_mm2 = home_area_mm2(skeleton) * (windows.spine_mm / skeleton.length) ** 2
+    # of an animal from above, about; only ranks the blobs of a window
+    home_mm2 = _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
+    area_mm2 = home_mm2 * (windows.spine_mm / skeleton.length) ** 2
     # a scene learned from a recording has an estimate of its readings' spread
     least_mm = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)
     return cut.extract(size, area_mm2, least_mm, camera_view, n_candidates=n_candidates)
@@ -483,14 +484,6 @@ def with_truth(
         (windows.spine_mm / skeleton.length)[good],
         animal[good],
     )
-
-
-def home_area_mm2(skeleton: Skeleton) -> float:
-    """Approximate area, mm^2, of a home-sized animal from above; it only ranks blobs by size.
-
-    A fixed value for the mouse, else the area of the skeleton's surface in the home pose.
-    """
-    return _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
 
 
 def cache_path(animal: str, variant: str, draw: int = 0) -> Path:
