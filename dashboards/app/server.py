@@ -199,10 +199,10 @@ def make_app(
             `correct` does.
         suggest: finds the stretches of a session whose actions are least certain; None finds none.
         reviews: folder of blinded reviews, created with the first one; None accepts none.
-        regions: reads and writes the regions of recordings, with `of_recordings`, whether
-            recordings without results are available; `about(key, session)`, facts about a recording's region;
+        regions: reads and writes the regions of recordings: `of_recordings`, whether recordings
+            without results are available; `about(key, session)`, facts about a region;
             `save(key, session, place, corners, was)`, which saves corners (px) in a place that
-            contained `was`; and `picture(key)`, the usual depth (mm) of a recording's pixels and its
+            contained `was`; and `picture(key)`, the usual depth (mm) of every pixel, and the
             camera. None writes none.
     """
     app = Flask(
