@@ -294,7 +294,7 @@ def _look(
             done = failure or f"shows an animal of {found['animal']['spine_mm']:.1f} mm"
             _ended(shown, found["session_id"], "could not be looked at", done)
 
-        crew.look_at(sessions, look, shown.told, finished)
+        crew.look_at(sessions, look, shown.report, finished)
 
 
 def _ended(shown: Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
@@ -319,4 +319,4 @@ def _measure(
             done = f"is done, in {result['seconds']:.0f} s{taken}{look}"
             _ended(shown, result["id"], "failed", result["failure"] or done)
 
-        crew.measure(todo, run, shown.told, finished)
+        crew.measure(todo, run, shown.report, finished)
