@@ -178,27 +178,27 @@ class Pose(Rows):
             joints: (..., J, 3) mm.
             up: (3,) or (..., 3), any length.
         """
-        joints, up = np.asarray(joints, float), np.asarray(up, float)
+        at = np.asarray(joints, float)
         children = skeleton.next_joint
-        along = joints[..., 1:, :] - joints[..., skeleton.parents[1:], :]
+        along = at[..., 1:, :] - at[..., skeleton.parents[1:], :]
         length = np.linalg.norm(along, axis=-1)
         scale = length.sum(-1) / np.linalg.norm(skeleton.offsets[1:], axis=-1).sum()
         forward = _unit(along[..., 0, :] * np.sign(skeleton.offsets[children[0], 0]))
         # a base that points straight up or down has no yaw: use the next axis
-        up = np.broadcast_to(up, forward.shape)
-        vertical = np.abs(np.sum(forward * up, axis=-1, keepdims=True)) > 0.999 * _length(up)
-        side = _unit(so3.cross(np.where(vertical, np.roll(up, 1, axis=-1), up), forward))
+        upward = np.broadcast_to(np.asarray(up, float), forward.shape)
+        vertical = np.abs(np.sum(forward * upward, axis=-1, keepdims=True)) > 0.999 * _length(
+            upward
+        )
+        side = _unit(so3.cross(np.where(vertical, np.roll(upward, 1, axis=-1), upward), forward))
         rotation = np.stack([forward, side, so3.cross(forward, side)], axis=-1)
-        root = SE3(rotation, joints[..., 0, :])
-        angles = np.zeros(joints.shape)
+        root = SE3(rotation, at[..., 0, :])
+        angles = np.zeros(at.shape)
         for j in range(1, skeleton.n_joints):
             rotation = rotation @ skeleton.rest[j]
             child = children[j]
             if child < 0:
                 continue
-            wanted = np.einsum(
-                "...ji,...j->...i", rotation, joints[..., child, :] - joints[..., j, :]
-            )
+            wanted = np.einsum("...ji,...j->...i", rotation, at[..., child, :] - at[..., j, :])
             angles[..., j, :] = aim(skeleton.offsets[child], wanted)
             rotation = rotation @ so3.exp(angles[..., j, :])
         return Pose(root, angles, scale)

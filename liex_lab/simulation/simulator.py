@@ -153,7 +153,10 @@ def world_of(skeleton: Skeleton) -> Simulator:
     """
     if skeleton.name == "hand":
         return HandSimulator(skeleton, find_reference())
-    known = {"mouse": MouseSpecies, "fish": FishSpecies}
+    known: dict[str, Callable[[Skeleton], Species]] = {
+        "mouse": MouseSpecies,
+        "fish": FishSpecies,
+    }
     return BodySimulator(known.get(skeleton.name, GenericSpecies.of)(skeleton))
 
 
