@@ -1,11 +1,13 @@
 """What hypothesis draws for rigid motion."""
 
 import numpy as np
+from hypothesis import settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+few = settings(max_examples=20)
 millimetres = st.floats(-1000.0, 1000.0)
 # everyday angles, and those where a formula loses its digits
 angles = st.one_of(

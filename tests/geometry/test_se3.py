@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 
 from liex_lab.geometry import SE3
-from tests.geometry.strategies import Array, twists
+from tests.geometry.strategies import Array, few, twists
 from tests.oracles import motion
 
 
@@ -18,6 +18,7 @@ def assert_same(first: SE3, second: SE3) -> None:
     assert_close(first.matrix, second.matrix)
 
 
+@few
 @given(a=twists(), b=twists(), c=twists())
 def test_transforms_are_a_group(a: Array, b: Array, c: Array) -> None:
     g, h, k = SE3.exp(a), SE3.exp(b), SE3.exp(c)
@@ -31,11 +32,13 @@ def test_transforms_are_a_group(a: Array, b: Array, c: Array) -> None:
     assert_close((g @ h) @ p, (g.matrix @ h.matrix @ [*p, 1.0])[:3])
 
 
+@few
 @given(xi=twists())
 def test_exp_agrees_with_the_matrix_exponential(xi: Array) -> None:
     assert_close(SE3.exp(xi).matrix, motion.exp(xi))
 
 
+@few
 @given(xi=twists())
 def test_exp_and_log_undo_one_another(xi: Array) -> None:
     g = SE3.exp(xi)
@@ -45,6 +48,7 @@ def test_exp_and_log_undo_one_another(xi: Array) -> None:
         assert_close(g.log(), xi)
 
 
+@few
 @given(a=twists(), b=twists())
 def test_the_adjoint_carries_a_twist_into_the_other_frame(a: Array, b: Array) -> None:
     g, h, xi = SE3.exp(a), SE3.exp(b), 0.001 * b
@@ -54,6 +58,7 @@ def test_the_adjoint_carries_a_twist_into_the_other_frame(a: Array, b: Array) ->
     assert_close((g @ h).adjoint(), g.adjoint() @ h.adjoint())
 
 
+@few
 @given(a=twists(), b=twists())
 def test_a_geodesic_joins_its_ends_at_constant_speed_on_the_shorter_way(a: Array, b: Array) -> None:
     g, h = SE3.exp(a), SE3.exp(b)

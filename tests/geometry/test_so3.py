@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 
 from liex_lab.geometry import so3
-from tests.geometry.strategies import Array, directions, rotation_vectors
+from tests.geometry.strategies import Array, directions, few, rotation_vectors
 from tests.oracles import motion
 
 
+@few
 @given(omega=rotation_vectors())
 def test_log_undoes_exp(omega: Array) -> None:
     back = so3.log(so3.exp(omega))
@@ -20,6 +21,7 @@ def test_log_undoes_exp(omega: Array) -> None:
     assert error < 1e-9
 
 
+@few
 @given(direction=directions())
 def test_log_undoes_exp_up_to_pi(direction: Array) -> None:
     for below_pi in (0.0, 1e-15, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3):
@@ -33,6 +35,7 @@ def test_log_undoes_exp_up_to_pi(direction: Array) -> None:
     assert np.linalg.norm(np.cross(half_turn, direction)) < 1e-9
 
 
+@few
 @given(omega=rotation_vectors())
 def test_exp_is_the_matrix_exponential_and_a_proper_rotation(omega: Array) -> None:
     rotation = so3.exp(omega)
@@ -41,6 +44,7 @@ def test_exp_is_the_matrix_exponential_and_a_proper_rotation(omega: Array) -> No
     assert abs(np.linalg.det(rotation) - 1.0) < 1e-13
 
 
+@few
 @given(a=rotation_vectors(), b=rotation_vectors())
 def test_cross_and_hat_are_the_cross_product(a: Array, b: Array) -> None:
     np.testing.assert_array_equal(so3.cross(a, b), np.cross(a, b))
@@ -48,6 +52,7 @@ def test_cross_and_hat_are_the_cross_product(a: Array, b: Array) -> None:
     np.testing.assert_array_equal(so3.cross(a, np.stack([b, a])), np.cross(a, np.stack([b, a])))
 
 
+@few
 @given(omega=rotation_vectors())
 def test_the_inverse_of_the_left_jacobian_is_its_inverse(omega: Array) -> None:
     np.testing.assert_allclose(
@@ -75,6 +80,7 @@ def test_batches_are_what_single_ones_are() -> None:
         np.testing.assert_allclose(so3.log(rotations)[index], so3.log(rotations[index]), atol=1e-15)
 
 
+@few
 @given(omega=rotation_vectors())
 def test_a_dented_rotation_is_mended(omega: Array) -> None:
     rotation = so3.exp(omega)
@@ -86,6 +92,7 @@ def test_a_dented_rotation_is_mended(omega: Array) -> None:
     assert np.linalg.det(so3.nearest_rotation(np.diag([1.0, 1.0, -1.0]))) > 0  # a reflection
 
 
+@few
 @given(omega=rotation_vectors())
 def test_the_mean_lies_in_the_middle(omega: Array) -> None:
     centre = so3.exp(omega)
