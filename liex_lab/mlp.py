@@ -6,8 +6,6 @@ with rectified linear units between the layers and none after the last, which gi
 and prediction give the same bits on any number of cores.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -38,7 +36,7 @@ class Network:
     layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
 
     @staticmethod
-    def plain(layers: Iterable[Sequence[NDArray[np.float32]]]) -> Network:
+    def plain(layers: Iterable[Sequence[NDArray[np.float32]]]) -> "Network":
         """A network of these layers whose features are not standardised."""
         packed = tuple((weights, bias) for weights, bias in layers)
         n = len(packed[0][0])

@@ -5,8 +5,6 @@ of flips, moved joints and edited bouts, and the tables derived from the active 
 replaces the folder as a whole, and its predecessor is removed only once the new one is on disk.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
@@ -198,7 +196,7 @@ def _summary(log: corrections.Log) -> dict[str, Any]:
 
 
 def _behaviour(
-    raw: Session, log: corrections.Log, found: CorrectedTrack, results: evidence.Results
+    raw: Session, log: corrections.Log, found: "CorrectedTrack", results: evidence.Results
 ) -> tuple[Behaviour, dict[str, Any]]:
     """The behaviour of the corrected track, and facts about it for session.json.
 

@@ -5,8 +5,6 @@ nothing from other sites (content security policy). An internal error gives one 
 and a message for the visitor.
 """
 
-from __future__ import annotations
-
 import hmac
 import logging
 import re
@@ -241,7 +239,7 @@ def _views(
     clerk: corrections.Clerk,
     desks: Desks,
     scenes: Scenes,
-    downloads: Downloads,
+    downloads: "Downloads",
 ) -> Views:
     """Every address of the dashboard, and what answers it."""
     return {

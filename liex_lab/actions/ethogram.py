@@ -2,8 +2,6 @@
 nanoseconds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -116,7 +114,7 @@ class Ethogram:
         part: NDArray[np.int64] | None = None,
         source: str = "model",
         names: Sequence[str] | None = None,
-    ) -> Ethogram:
+    ) -> "Ethogram":
         """The bouts of labelled frames; frames that are `UNLABELLED` belong to none.
 
         Args:

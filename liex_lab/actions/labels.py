@@ -8,8 +8,6 @@ with a true bout of its action is at least 0.5 (segmental F1@50, Lea et al. 2017
 of a share is Wilson's (1927).
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -161,7 +159,7 @@ class LabelledTrack:
         """The number of frames."""
         return len(self.words)
 
-    def __getitem__(self, rows: slice | NDArray[np.int64]) -> LabelledTrack:
+    def __getitem__(self, rows: slice | NDArray[np.int64]) -> "LabelledTrack":
         """Some of its frames."""
         assert self.wall_mm is not None
         truth = None if self.truth is None else self.truth[rows]

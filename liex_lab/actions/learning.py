@@ -6,8 +6,6 @@ Validation is leave-one-animal-out. The paper's recogniser, forests over descrip
 serves as the baseline.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -400,7 +398,7 @@ class SequenceForest:
     forest: Any
 
     @staticmethod
-    def learn(descriptor: str, rows: Array, words: Sequence[str], seed: int) -> SequenceForest:
+    def learn(descriptor: str, rows: Array, words: Sequence[str], seed: int) -> "SequenceForest":
         """A forest from the descriptors of sequences and their words.
 
         Args:

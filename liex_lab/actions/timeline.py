@@ -12,8 +12,6 @@ This method is our own; the recogniser of Lie-X section 4.3 names cut-out sequen
 (`recogniser`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -60,7 +58,7 @@ class SemiMarkovModel:
     follow: Array
 
     @staticmethod
-    def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> SemiMarkovModel:
+    def learn(runs: Sequence[Sequence[tuple[int, float]]], n_words: int) -> "SemiMarkovModel":
         """The model of labelled bouts; words without bouts get default durations (0.1 s and 0.5 s).
 
         Args:
@@ -264,7 +262,7 @@ class TimelineModel:
         wall_mm: Array | None = None,
         allocate: Allocator = np.empty,
         broken: Broken | None = None,
-    ) -> Recognised:
+    ) -> "Recognised":
         """The ethogram of a track, and the probability of each word in each of its frames.
 
         Args:

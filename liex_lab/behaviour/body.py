@@ -1,7 +1,5 @@
 """Roles of the joints in an animal's skeleton: front, rear, midline, heading axis and trunk."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -51,7 +49,7 @@ class BodyAxis:
         return self.spine[1:-1] or self.spine[:1]
 
     @staticmethod
-    def of(joints: Sequence[str], parents: Sequence[int] | None = None) -> BodyAxis:
+    def of(joints: Sequence[str], parents: Sequence[int] | None = None) -> "BodyAxis":
         """The roles by name or along the chain, which begins at the head or at the rump.
 
         A chain that begins at a head is a swimming animal; any other chain begins at the rump. A

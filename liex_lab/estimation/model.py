@@ -6,8 +6,6 @@ child pointers being implied by the order of growth; `settler` is the ridge corr
 `facing_*` the head-tail classifier. Loading never runs code, and equal models give equal bytes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -169,7 +167,7 @@ class Model:
         return packed.getvalue()
 
     @staticmethod
-    def load(path: Path) -> Model:
+    def load(path: Path) -> "Model":
         """Read a model file.
 
         Args:

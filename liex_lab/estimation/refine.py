@@ -31,8 +31,6 @@ changes if
 with w = 4 mm at the reference length.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,7 +71,7 @@ class Refiner:
     body: residual_kernels.SphereModel
 
     @staticmethod
-    def of(skeleton: Skeleton, balls: Spheres) -> Refiner:
+    def of(skeleton: Skeleton, balls: Spheres) -> "Refiner":
         """The refinement for a skeleton of any shape.
 
         Args:
@@ -213,7 +211,7 @@ class RidgeCorrection:
         size: Array,
         true_joints: Array,
         true_size: Array,
-    ) -> RidgeCorrection:
+    ) -> "RidgeCorrection":
         """Fit the correction to chosen poses with known truth.
 
         Poses with an error of a tenth of the length or more, or of 0.25 in the logarithm of the

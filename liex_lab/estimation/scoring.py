@@ -16,8 +16,6 @@ joint j, in the base's frame, at home size, and corrects its predictable part (t
 correction", ours). It is evaluated for one pose per frame, at negligible cost.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -72,11 +70,11 @@ class Chosen:
     frame_scale: Array
     scale_trust: Array
 
-    def __getitem__(self, rows: slice) -> Chosen:
+    def __getitem__(self, rows: slice) -> "Chosen":
         """A slice of the frames."""
         return Chosen(*(getattr(self, field.name)[rows] for field in fields(self)))
 
-    def spread_over(self, usable: NDArray[np.bool_]) -> Chosen:
+    def spread_over(self, usable: NDArray[np.bool_]) -> "Chosen":
         """These poses as the usable ones of n frames, in order; rows of NaN elsewhere."""
 
         def rows(values: Array) -> Array:

@@ -5,8 +5,6 @@ description the comment over that setting (`Plan.to_toml`): a change of either c
 that are written.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable
@@ -268,7 +266,7 @@ class Region(SettingsTable):
         return {"polygon": value} if isinstance(value, list) else value
 
     @model_validator(mode="after")
-    def _one_shape(self) -> Region:
+    def _one_shape(self) -> "Region":
         if [self.polygon, self.rectangle, self.circle].count(None) != 2:
             raise ValueError(
                 "a region is one of polygon = [[x, y], [x, y], [x, y], ...], rectangle = [[x, y], "

@@ -4,8 +4,6 @@ Keys are in [camera] (or [recording], or at the top level); all are optional. An
 reported with the closest valid one. Also: infrared images, recognised by their names.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable
@@ -141,7 +139,7 @@ class CameraFile:
     distortion: Distortion | None = None
 
     @staticmethod
-    def read(path: Path) -> CameraFile:
+    def read(path: Path) -> "CameraFile":
         """Parse the file; defaults if it does not exist.
 
         Args:

@@ -6,8 +6,6 @@ a date and time, seconds since 1970 with a fraction (as in the TUM RGB-D data se
 digits of ms, µs or ns since 1970.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -85,7 +83,7 @@ class Stamps:
     named: bool = False
 
     @staticmethod
-    def of(path: Path, rows: list[tuple[int, list[str]]], k: int) -> Stamps:
+    def of(path: Path, rows: list[tuple[int, list[str]]], k: int) -> "Stamps":
         """The column k of a table.
 
         Args:

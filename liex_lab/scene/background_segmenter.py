@@ -12,8 +12,6 @@ height map and image moments (see `height_maps`). `find_resting_animal` finds an
 rest, wholly or in part, and therefore absorbed into the background.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -382,7 +380,7 @@ class BackgroundSubtraction(Segmenter):
     @staticmethod
     def from_floor(
         camera: Camera, floor: Floor, min_height_mm: float = 7.0
-    ) -> BackgroundSubtraction:
+    ) -> "BackgroundSubtraction":
         """A segmenter whose background is the bare floor plane.
 
         Args:

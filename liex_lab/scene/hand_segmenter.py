@@ -9,8 +9,6 @@ surface is cut a hand's length behind the fingertips. A score with weights learn
 regression selects the best end; see the kernels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,7 +68,7 @@ class HandSegmenter(Segmenter):
         view: CameraView,
         n_frames: int = 96,
         range_mm: tuple[float, float] = RANGE_MM,
-    ) -> tuple[HandSegmenter, NDArray[np.float32]]:
+    ) -> "tuple[HandSegmenter, NDArray[np.float32]]":
         """The hand segmenter of a recording, with the hand's usual area, volume and depth.
 
         Args:
@@ -176,7 +174,7 @@ class HandSegmenter(Segmenter):
                 n_candidates,
             )
 
-    def every(self, step: int) -> HandSegmenter:
+    def every(self, step: int) -> "HandSegmenter":
         """The same segmenter for images of every `step`-th row and column."""
         camera = self.camera.every(step)
         return replace(self, camera=camera, floor=self.floor.for_camera(camera))

@@ -12,8 +12,6 @@ better of the two is accepted if its median residual is at most the larger of 4 
 size. The background just beyond the outline decides whether there are walls or a drop.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -99,7 +97,7 @@ class Arena:
         }
 
     @staticmethod
-    def from_dict(numbers: dict[str, Any]) -> Arena:
+    def from_dict(numbers: dict[str, Any]) -> "Arena":
         """The arena that `to_dict` wrote."""
         values: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
@@ -376,7 +374,7 @@ class Fixture:
         }
 
     @staticmethod
-    def from_dict(numbers: Mapping[str, Any]) -> Fixture:
+    def from_dict(numbers: Mapping[str, Any]) -> "Fixture":
         """The fixture that `to_dict` wrote, an entry of `scene.fixtures` in session.json."""
         x, y = numbers["centre_mm"][:2]
         times = numbers.get("since_s"), numbers.get("until_s")

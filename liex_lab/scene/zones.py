@@ -9,8 +9,6 @@ the number of sides that a ray along x crosses. Zones may be drawn in pixels; th
 outline are intersected with the floor, 1 / z = a u + b v + c.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -192,7 +190,7 @@ class Zone:
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @staticmethod
-    def from_dict(numbers: dict[str, Any]) -> Zone:
+    def from_dict(numbers: dict[str, Any]) -> "Zone":
         """The zone that `to_dict` wrote."""
         return TypeAdapter(Zone).validate_python(numbers)
 

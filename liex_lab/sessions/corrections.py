@@ -7,8 +7,6 @@ its own content. `Session.open` reads the corrected tables; `Session.open(path, 
 measured ones.
 """
 
-from __future__ import annotations
-
 import getpass
 import hashlib
 import json
@@ -190,7 +188,7 @@ class LogEntry:
         return {**about, "kind": self.what.kind, **asdict(self.what)}
 
     @staticmethod
-    def from_dict(entry: Mapping[str, Any]) -> LogEntry:
+    def from_dict(entry: Mapping[str, Any]) -> "LogEntry":
         """Inverse of `to_dict`.
 
         Raises:
@@ -274,7 +272,9 @@ class Log:
         """The active corrections of measurements: all except descriptions."""
         return tuple(one for one in self.standing if not isinstance(one.what, Description))
 
-    def added(self, what: Sequence[Correction], undo: Sequence[int] = (), author: str = "") -> Log:
+    def added(
+        self, what: Sequence[Correction], undo: Sequence[int] = (), author: str = ""
+    ) -> "Log":
         """The log with further entries: first undos and redos, then new corrections.
 
         Args:

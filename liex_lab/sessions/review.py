@@ -7,8 +7,6 @@ can resume. Each rater gets the clips in an individual order, derived from the r
 rater's name.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -86,7 +84,7 @@ class Review:
         """Whether a rater has labelled every clip."""
         return len(self.answers.get(rater, {})) == len(self.clips)
 
-    def answered(self, rater: str, clip: int, word: str) -> Review:
+    def answered(self, rater: str, clip: int, word: str) -> "Review":
         """The review with one answer added or replaced.
 
         Args:
@@ -130,7 +128,7 @@ class Review:
         return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
     @staticmethod
-    def from_json(text: str) -> Review:
+    def from_json(text: str) -> "Review":
         """Inverse of `to_json`.
 
         Args:

@@ -19,8 +19,6 @@ transforms instead of a mesh: the trunk at home pose is cut at its joints, and e
 to its nearest bone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
@@ -157,7 +155,7 @@ class DepthColumns:
         self._shown = set(waiting[-1].parts)
         return len(entities)
 
-    def _send_lens(self, stream: Any, k: int, waiting: Sequence[_KeptImage]) -> None:
+    def _send_lens(self, stream: Any, k: int, waiting: "Sequence[_KeptImage]") -> None:
         """Send the intrinsics of the k-th cut-out of frames, and its position in the image."""
         boxes = np.array([image.windows[k] for image in waiting], np.float64)
         if not (boxes[:, 2] > boxes[:, 0]).any() and k:

@@ -6,8 +6,6 @@ other doubts: on the terminal, in `verdict` of session.json, at the top of the r
 session list of a study.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -64,7 +62,7 @@ class Verdict:
         n_animals: int = 1,
         cautions: Sequence[str] = (),
         accepted: bool = False,
-    ) -> Verdict:
+    ) -> "Verdict":
         """The verdict on a track.
 
         Args:

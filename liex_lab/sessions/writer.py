@@ -9,8 +9,6 @@ unfinished session, which appends them in order. If a worker dies, another one m
 second time: a shard is published by an atomic rename, and both versions are equal.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -140,7 +138,7 @@ class SessionWriter:
             self._checkpoint.leave(keep=True)
             raise
 
-    def __enter__(self) -> SessionWriter:
+    def __enter__(self) -> "SessionWriter":
         return self
 
     def __exit__(

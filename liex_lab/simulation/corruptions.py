@@ -7,8 +7,6 @@ that disappears in the floor's noise or in glare (faint), stretches at two to th
 finished depth images; `visible_share` measures how much of the animal an occluder leaves visible.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -259,7 +257,7 @@ class Loss:
         joints: Array,
         length_mm: float,
         floats: bool,
-    ) -> Loss:
+    ) -> "Loss":
         """Draw the lost readings of a script.
 
         Args:

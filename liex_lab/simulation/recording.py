@@ -8,8 +8,6 @@ reported: 'clean', 'hard' (twice the noise, an eroded outline, other objects), '
 and the held-out split 'sealed'.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -311,7 +309,7 @@ class SyntheticSession(TrueRecording):
         spine_mm: float | None = None,
         species: Species | None = None,
         name: str | None = None,
-    ) -> SyntheticSession:
+    ) -> "SyntheticSession":
         """A session of independent postures and positions before one camera, drawn from the seed.
 
         Camera, arena and animal are the same in all frames.

@@ -9,8 +9,6 @@ the walls, the clutter and the image border.
 Arena frame: z up from the floor, the origin at the foot of the camera's perpendicular.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -239,7 +237,7 @@ class SimulatedScene:
     @staticmethod
     def draw(
         rng: np.random.Generator, camera: Camera, spine_mm: float, setting: SceneSpec = ARENA
-    ) -> SimulatedScene:
+    ) -> "SimulatedScene":
         """A random arena, large enough for the animal, with the floor's centre in view.
 
         Walls are at least 1.6 body lengths from the centre; about a third of the scenes have one or
@@ -276,7 +274,7 @@ class SimulatedScene:
 
     def _furnished(
         self, rng: np.random.Generator, spine_mm: float, setting: SceneSpec
-    ) -> SimulatedScene:
+    ) -> "SimulatedScene":
         """The scene with its depth image, and in a third of cases with one or two objects."""
         still = self._ideal_depth(rng, setting.scale)
         T_camera_arena = self.T_arena_camera.inverse()

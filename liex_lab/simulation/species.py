@@ -4,8 +4,6 @@
 is the mouse, `FishSpecies` the zebrafish, `GenericSpecies` any animal with a skeleton.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -343,7 +341,7 @@ class GenericSpecies(Species):
     """
 
     @staticmethod
-    def of(skeleton: Skeleton) -> GenericSpecies:
+    def of(skeleton: Skeleton) -> "GenericSpecies":
         """The species of a skeleton: visible by the Raytrix R5 below 35 mm of length, in a scene in
         which the whole animal is visible from anywhere, at a sufficient size.
         """

@@ -6,8 +6,6 @@ kinds of rears. Writers, readers, columns.json, the report and the manual read t
 `write_table` refuses a column without an entry.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -284,7 +282,7 @@ class Words:
     def __len__(self) -> int:
         return len(self.codes)
 
-    def __getitem__(self, rows: slice) -> Words:
+    def __getitem__(self, rows: slice) -> "Words":
         """Some consecutive rows."""
         return Words(self.codes[rows], self.words)
 

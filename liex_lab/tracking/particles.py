@@ -15,8 +15,6 @@ Choices that the paper leaves open are stated in `ProcessNoise` and in `Particle
 is kept for the evaluation tables; the default tracker is `curve` (`offline`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,7 +48,7 @@ class ProcessNoise:
     sigma_mm: float = 2.0
 
     @staticmethod
-    def of(name: str, variant: str = "default", base_rounds: int = 0) -> ProcessNoise:
+    def of(name: str, variant: str = "default", base_rounds: int = 0) -> "ProcessNoise":
         """The parameters of an animal.
 
         Between two frames a fish moves and turns three times as far as a mouse, relative to its

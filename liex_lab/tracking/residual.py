@@ -19,8 +19,6 @@ from the end of the chain. The shift is at most 0.45 of the hidden share of the 
 the animal is whole or the hidden end is unclear.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,7 +129,7 @@ class BodyResidual:
         scene: Segmenter,
         camera_view: bool = False,
         size: float | None = None,
-    ) -> BodyResidual:
+    ) -> "BodyResidual":
         """The girth with which the default body explains these frames best: 13 are tried.
 
         Args:
@@ -499,7 +497,7 @@ class OcclusionCorrection:
         pose: Pose,
         crops: HeightMaps,
         depths: NDArray[np.float32],
-    ) -> OcclusionCorrection:
+    ) -> "OcclusionCorrection":
         """A correction with the usual ends from sampled frames that show the whole animal.
 
         Args:

@@ -5,8 +5,6 @@ the home length, girth of the body, usual error of depth); `observe` then gives 
 of every frame by the estimator of Lie-X Algorithm 1, and `track` smooths them all (`offline`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -91,7 +89,7 @@ class FrameTracker:
         bridge_s: float = BRIDGE_S,
         adapt: bool = True,
         stated: StatedShape | None = None,
-    ) -> FrameTracker:
+    ) -> "FrameTracker":
         """A tracker for a recording: a sample of its frames gives the animal's size and shape.
 
         Args:

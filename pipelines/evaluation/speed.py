@@ -12,8 +12,6 @@ latency, ms, of all frames since the first one that arrived after its predecesso
 which excludes learning the background.
 """
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -188,7 +186,7 @@ class SpeedSample:
         recordings: Sequence[TrueRecording],
         subject: PoseEstimator | Baseline,
         n_frames: int,
-    ) -> SpeedSample:
+    ) -> "SpeedSample":
         """The first frames of the recording with the widest depth images, repeated as needed."""
         recording = max(recordings, key=lambda one: one.width)
         scene, sample = build_scene(recording, plan_of(animal), subject.skeleton, 96)
@@ -201,7 +199,7 @@ class SpeedSample:
         """Size of the depth images, such as `640 x 480`."""
         return f"{self.scene.camera.width} x {self.scene.camera.height}"
 
-    def every(self, step: int) -> SpeedSample:
+    def every(self, step: int) -> "SpeedSample":
         """The same frames with every so many-th pixel of rows and columns."""
         return replace(
             self,

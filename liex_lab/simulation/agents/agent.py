@@ -7,8 +7,6 @@ heading and position, and redraws an action that would leave the bounds. Animals
 log-uniform traits (`Individual`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
@@ -65,7 +63,7 @@ class Individual:
     @staticmethod
     def draw(
         rng: np.random.Generator, sizes: tuple[float, float], novel: bool = False
-    ) -> Individual:
+    ) -> "Individual":
         """Draw an animal with traits exp(spread z), z uniform.
 
         Args:

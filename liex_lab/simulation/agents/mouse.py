@@ -6,8 +6,6 @@ each of the three inner joints, and the stretch of the body. `agents.agent` filt
 the actions, `mouse_poses` places the postures on the floor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -90,7 +88,7 @@ class MouseActor:
     rest: Array
 
     @staticmethod
-    def of(mouse: Individual, skeleton: Skeleton, shape: BodyShape, half: Array) -> MouseActor:
+    def of(mouse: Individual, skeleton: Skeleton, shape: BodyShape, half: Array) -> "MouseActor":
         """An actor with a given body.
 
         Args:

@@ -6,8 +6,6 @@ lumps at random positions; an animal's steps compress it and push it aside, epoc
 (`Bedding`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -296,7 +294,7 @@ class Ground:
     within: NDArray[np.bool_]
 
     @staticmethod
-    def draw(rng: np.random.Generator, arena: SimulatedScene) -> Ground:
+    def draw(rng: np.random.Generator, arena: SimulatedScene) -> "Ground":
         """Draw a floor with random unevenness."""
         x, y = (
             np.arange(-reach - 2 * _GRID_MM, reach + 2 * _GRID_MM + 0.1, _GRID_MM)
@@ -350,7 +348,7 @@ class Bedding:
     frames: int
 
     @staticmethod
-    def draw(rng: np.random.Generator, ground: Ground, tracks: Array, frames: int) -> Bedding:
+    def draw(rng: np.random.Generator, ground: Ground, tracks: Array, frames: int) -> "Bedding":
         """Draw the bedding under a walking animal.
 
         Args:

@@ -8,8 +8,6 @@ day and machine). Nothing checks that today's code gives the same numbers; the t
 of another version, and these rows are measured again before a release.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 import re
@@ -105,7 +103,7 @@ class Budget:
     @staticmethod
     def of(
         n_frames: int | None, quick: bool, fresh: bool, rows: Sequence[str], sealed: bool
-    ) -> Budget:
+    ) -> "Budget":
         """The budget for the options of the command line.
 
         Raises:

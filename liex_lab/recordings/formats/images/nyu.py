@@ -4,8 +4,6 @@ Depth is 256 green + blue, mm. The set has no times; its cameras ran at 30 frame
 usual 14 of its 36 joints.
 """
 
-from __future__ import annotations
-
 import re
 import zipfile
 from dataclasses import dataclass, replace
@@ -259,7 +257,7 @@ class NyuReference:
     answers: dict[str, Array]
 
     @staticmethod
-    def load(folder: str | Path) -> NyuReference:
+    def load(folder: str | Path) -> "NyuReference":
         """Load the reference from its file, or else from the data set's own.
 
         Args:

@@ -11,8 +11,6 @@ a = b f / (b - f) in front of it. `raw` values are 1 - 1 / v. Point clouds (XYZ 
 depth images by projection into a pinhole camera with a z-buffer.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -104,7 +102,7 @@ class Profile(BaseModel):
     grid_to_sensor_mm: Positive | None = None
 
     @model_validator(mode="after")
-    def _in_order(self) -> Profile:
+    def _in_order(self) -> "Profile":
         if not 0 <= self.valid_mm[0] < self.valid_mm[1]:
             raise ValueError("valid_mm is a nearest and a farthest depth, as in [20.0, 2000.0]")
         if min(self.columns) < 0:

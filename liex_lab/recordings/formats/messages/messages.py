@@ -8,8 +8,6 @@ CompressedImage, PointCloud2 and CameraInfo (`parsers`); std_msgs/String, std_ms
 diagnostic_msgs/KeyValue for statements of the RealSense programs (`Statements`).
 """
 
-from __future__ import annotations
-
 import bz2
 import json
 import re
@@ -666,7 +664,7 @@ class PackFacts(BaseModel):
     packed: Annotated[bool, Field(exclude=True)] = False
 
     @staticmethod
-    def of(notes: Mapping[str, str]) -> PackFacts:
+    def of(notes: Mapping[str, str]) -> "PackFacts":
         """The facts in a file's notes.
 
         Args:
