@@ -30,6 +30,19 @@ _CHROMIUM_FLAGS = [
     "--disable-sync",
 ]
 
+_LONGEST = tuple(
+    f"tests/{name}.py"
+    for name in (
+        "pipelines/evaluation/test_paper",
+        "test_pages",
+        "dashboards/test_figures",
+        "pipelines/evaluation/test_pose",
+        "pipelines/test_correct",
+        "estimation/test_model",
+        "pipelines/test_doctor",
+    )
+)
+
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=50, database=None)
 settings.load_profile("suite")
 
@@ -67,6 +80,11 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         from liex_lab.pipelines.compiling import compile_ahead
 
         compile_ahead("mouse", "fish", "hand")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the longest files, so that no worker waits for the other at the end."""
+    items.sort(key=lambda item: not item.nodeid.startswith(_LONGEST))
 
 
 def excuse(report: pytest.TestReport | pytest.CollectReport) -> str:

@@ -43,7 +43,7 @@ class Arena:
         half_mm: half the lengths of a rectangular one's sides, mm.
         yaw_rad: their rotation, rad.
         residual_mm: median distance of the outline from the shape, mm.
-        visible_share: visible share of the outline.
+        seen_share: visible share of the outline.
         edge: 'wall', 'drop' (the floor ends in the air) or 'unknown'.
     """
 
@@ -53,7 +53,7 @@ class Arena:
     half_mm: tuple[float, float] | None = None
     yaw_rad: float | None = None
     residual_mm: float | None = None
-    visible_share: float = 0.0
+    seen_share: float = 0.0
     edge: str = "unknown"
 
     def wall_distance_mm(self, xy_mm: Array) -> Array:
@@ -132,17 +132,17 @@ def find_arena(background: NDArray[np.float32], floor: Floor, camera: Camera) ->
     """
     points, pixels, share = _outline(background, floor, camera)
     if share < 0.6 or len(points) < 40:  # too little of it is in view
-        return Arena(OPEN, visible_share=share)
+        return Arena(OPEN, seen_share=share)
     edge = _edge(background, floor, camera, pixels)
     centre, radius, off_circle = fit_circle(points)
     middle, half, yaw, off_rectangle = fit_rectangle(points)
     size = float(np.sqrt(np.prod(half)))
     if min(off_circle, off_rectangle) > max(_FIT_MM, 0.025 * size):
-        return Arena("irregular", visible_share=share, edge=edge)
+        return Arena("irregular", seen_share=share, edge=edge)
     if off_circle <= off_rectangle:
         return Arena("round", _pair(centre), radius, None, None, off_circle, share, edge)
     if not _all_sides_in_view(points, middle, half, yaw):
-        return Arena(OPEN, visible_share=share, edge=edge)
+        return Arena(OPEN, seen_share=share, edge=edge)
     return Arena("rectangular", _pair(middle), None, _pair(half), yaw, off_rectangle, share, edge)
 
 

@@ -169,7 +169,7 @@ def test_a_plan_that_states_the_hand_is_believed(
         ({"error_mm": 20.0}, "31% of its length"),
         ({"residual_mm": 15.0}, "lies 15 mm from what was read"),
         ({"residual_mm": float("nan")}, "hardly overlap"),
-        ({"covered": 0.2}, "covers 20% of the outline"),
+        ({"covered": 0.2}, "covers 20% of the observed outline"),
         ({"beside": 0.7}, "70% of its body lies beside"),
     ],
 )

@@ -342,7 +342,9 @@ def test_a_slip_in_the_zones_is_told(tmp_path: Path) -> None:
         '[[zones]]\nname = "a"\ncircle = { centre = [0, 0], radius = -1 }'
     )
     path = plates(tmp_path / "r", walk(60.0))
-    assert "a positive number, got -1" in problems(path, f"arena.zones={tmp_path / 'zones.toml'}")
+    assert "radius should be greater than 0, got -1" in problems(
+        path, f"arena.zones={tmp_path / 'zones.toml'}"
+    )
     assert "there is no file" in problems(path, "arena.zones=none.toml")
 
 

@@ -76,7 +76,7 @@ def test_an_open_table_has_no_shape() -> None:
     table = np.full((240, 320), 600.0, np.float32)
     camera = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
     arena = find_arena(table, find_floor(table, camera), camera)
-    assert arena == Arena("open", visible_share=0.0)
+    assert arena == Arena("open", seen_share=0.0)
     assert np.isnan(arena.wall_distance_mm(np.zeros((3, 2)))).all()
 
 
@@ -133,7 +133,7 @@ def test_distances_to_the_wall_are_what_a_tape_would_say() -> None:
     "arena",
     [
         Arena("round", (1.5, -2.0), 200.0, None, None, 0.5, 1.0, "wall"),
-        Arena("open", visible_share=0.25),
+        Arena("open", seen_share=0.25),
         Arena("rectangular", (1.5, -2.0), None, (200.0, 100.0), 0.125, 0.5, 0.75, "drop"),
     ],
 )

@@ -84,7 +84,7 @@ def test_a_region_on_the_command_line_is_what_a_plan_states(words, setting):
 def test_a_region_on_the_command_line_that_is_none_is_told_how_to_write_one(words):
     from liex_lab.cli.options import region_setting
 
-    with pytest.raises(PlanError, match=r"'circle 160,120 90'; a last word mm"):
+    with pytest.raises(PlanError, match=r"'circle 160,120 90'; add mm at the end"):
         region_setting(words)
 
 

@@ -93,7 +93,7 @@ def test_where_in_the_arena_the_animal_is_stands_in_the_tables(tmp_path):
     """The mouse goes round a circle of 150 mm, 50 mm from the wall; a third of the zone's circle
     covers its way.
     """
-    bowl = Arena("round", (0.0, 0.0), 200.0, visible_share=1.0, edge="wall")
+    bowl = Arena("round", (0.0, 0.0), 200.0, seen_share=1.0, edge="wall")
     half = Zone("upper", polygon_mm=((-300.0, 0.0), (300.0, 0.0), (300.0, 300.0), (-300.0, 300.0)))
     mouse = WalkingMouse(steady(2 * np.pi * 150 / 200), lost=(7,))
     optics = {"distortion": None, "water": {"height_mm": 300.0}}
