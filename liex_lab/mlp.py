@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import refuse
 from liex_lab.runtime.processes import serial_products
 
 Array = NDArray[np.float64]
@@ -76,21 +75,11 @@ def check_layers(network: Network, n_outputs: int) -> None:
         sound = sound and np.ndim(weights) == 2 and np.shape(weights)[:1] == before
         before = np.shape(bias)
         sound = sound and np.shape(weights)[1:] == before
-    refuse(
-        ValueError,
-        (
-            not sound or before != (n_outputs,),
-            f"the layers of a network do not lead to {n_outputs} numbers",
-        ),
-    )
+    if not sound or before != (n_outputs,):
+        raise ValueError(f"the layers of a network do not lead to {n_outputs} numbers")
     numbers = [network.centre, network.scale, *(part for layer in network.layers for part in layer)]
-    refuse(
-        ValueError,
-        (
-            not all(part.dtype.kind == "f" and np.isfinite(part).all() for part in numbers),
-            "a network's weights are not all finite numbers",
-        ),
-    )
+    if not all(part.dtype.kind == "f" and np.isfinite(part).all() for part in numbers):
+        raise ValueError("a network's weights are not all finite numbers")
 
 
 def descend(

@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 from liex_lab.baselines import _kernels as kernels
 from liex_lab.body.pose import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import MissingPackageError, ModelError, refuse
+from liex_lab.errors import MissingPackageError, ModelError
 from liex_lab.estimation.cascade import TrainingSet
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.training import ProgressCallback
@@ -631,14 +631,11 @@ def require_torch() -> None:
     """Raise MissingPackageError unless torch is installed."""
     from importlib.util import find_spec
 
-    refuse(
-        MissingPackageError,
-        (
-            find_spec("torch") is None,
+    if find_spec("torch") is None:
+        raise MissingPackageError(
             "the CNN baseline needs torch, which is not installed; in the folder of liex_lab, run "
-            "pip install '.[cnn]'",
-        ),
-    )
+            "pip install '.[cnn]'"
+        )
 
 
 def alexnet(n_outputs: int, plan: CnnPlan) -> torch.nn.Sequential:

@@ -86,14 +86,11 @@ class BodyShape(Body):
             LiexError: the joints are not one chain, or the table is incomplete.
         """
         table = skeleton.surface
-        refuse(
-            LiexError,
-            (
-                not skeleton.is_chain,
+        if not skeleton.is_chain:
+            raise LiexError(
                 f"the [surface] of '{skeleton.name}' has stations, but its joints are not one "
-                "chain, each the parent of the next; give radii_mm instead",
-            ),
-        )
+                "chain, each the parent of the next; give radii_mm instead"
+            )
         try:
             width = np.array(table["half_width_mm"], float)
             height = np.array(table["half_height_mm"], float)
@@ -107,14 +104,11 @@ class BodyShape(Body):
             raise LiexError(
                 f"the [surface] of the skeleton '{skeleton.name}' is incomplete: {error}"
             ) from None
-        refuse(
-            LiexError,
-            (
-                not len(width) == len(height) == len(table["stations"]) >= 4,
+        if not len(width) == len(height) == len(table["stations"]) >= 4:
+            raise LiexError(
                 f"the [surface] of '{skeleton.name}' needs equally many stations, half_width_mm "
-                "and half_height_mm, at least 4",
-            ),
-        )
+                "and half_height_mm, at least 4"
+            )
         return BodyShape(
             width, height, np.array(2.0), np.array(blobs, float).reshape(-1, 6), tail, np.array(0.5)
         )
@@ -160,15 +154,12 @@ class Capsules(Body):
             LiexError: there is not one positive radius for each joint, or a capsule is invalid.
         """
         radii = np.array(skeleton.surface.get("radii_mm", []), float)
-        refuse(
-            LiexError,
-            (
-                radii.shape != (skeleton.n_joints,) or not (radii > 0).all(),
+        if radii.shape != (skeleton.n_joints,) or not (radii > 0).all():
+            raise LiexError(
                 f"the [surface] of '{skeleton.name}' needs radii_mm, one positive number for each "
                 f"of its {skeleton.n_joints} joints, or stations with half_width_mm and "
-                "half_height_mm",
-            ),
-        )
+                "half_height_mm"
+            )
         bones = np.array(skeleton.edges, np.int64).reshape(-1, 2)
         more = Capsules.listed(skeleton, PARTS[0])
         return Capsules(
@@ -238,37 +229,24 @@ def _parsed(
 ) -> tuple[list[int], list[list[float]], list[float]]:
     """Joints, offsets and radii of one [[surface.capsules]] or [[surface.beyond]]."""
     where = f"the [[surface.{part}]] of '{skeleton.name}'"
-    refuse(
-        LiexError,
-        (
-            not isinstance(table, dict) or not set(table) <= _KEYS,
-            f"{where} have the keys {', '.join(sorted(_KEYS))}, got {table}",
-        ),
-    )
+    if not isinstance(table, dict) or not set(table) <= _KEYS:
+        raise LiexError(f"{where} have the keys {', '.join(sorted(_KEYS))}, got {table}")
     names = [table.get("from"), table.get("to")]
     for name in names:
-        refuse(
-            LiexError,
-            (
-                name not in skeleton.names,
-                f"{where} connect two joints, but there is no joint {name!r}",
-            ),
-        )
+        if name not in skeleton.names:
+            raise LiexError(f"{where} connect two joints, but there is no joint {name!r}")
     offsets = [table.get("from_mm", [0.0] * 3), table.get("to_mm", [0.0] * 3)]
     radii = table.get("radii_mm", [])
-    refuse(
-        LiexError,
-        (
-            not (
-                _numbers(offsets[0], 3)
-                and _numbers(offsets[1], 3)
-                and _numbers(radii, 2)
-                and min(radii) > 0
-            ),
+    if not (
+        _numbers(offsets[0], 3)
+        and _numbers(offsets[1], 3)
+        and _numbers(radii, 2)
+        and min(radii) > 0
+    ):
+        raise LiexError(
             f"{where} have from_mm and to_mm of three numbers and radii_mm of two positive ones, "
-            f"got {table}",
-        ),
-    )
+            f"got {table}"
+        )
     return [skeleton.names.index(name) for name in names], offsets, radii
 
 

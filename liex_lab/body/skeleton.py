@@ -79,39 +79,29 @@ class CameraView:
             LiexError: an unknown key, or a value out of its range.
         """
         keys = CameraView.__annotations__
-        refuse(
-            LiexError, (not isinstance(table, dict), f"{origin}: [view] is a table, got {table!r}")
-        )
+        if not isinstance(table, dict):
+            raise LiexError(f"{origin}: [view] is a table, got {table!r}")
         for key in table:
-            refuse(
-                LiexError,
-                (
-                    key not in keys,
-                    f"{origin}: [view] has an unknown key '{key}'; use {', '.join(keys)}",
-                ),
-            )
+            if key not in keys:
+                raise LiexError(
+                    f"{origin}: [view] has an unknown key '{key}'; use {', '.join(keys)}"
+                )
         for key, choices in (("foreground", FOREGROUNDS), ("frame", VIEWS)):
             value = table.get(key, choices[0])
-            refuse(
-                LiexError,
-                (
-                    value not in choices,
-                    f"{origin}: [view] {key} is one of {', '.join(choices)}, got {value!r}",
-                ),
-            )
+            if value not in choices:
+                raise LiexError(
+                    f"{origin}: [view] {key} is one of {', '.join(choices)}, got {value!r}"
+                )
         area = table.get("area", list(_AREA))
-        refuse(
-            LiexError,
-            (
-                not (
-                    isinstance(area, list)
-                    and [_is_number(a) for a in area] == [True, True]
-                    and 0 < area[0] < area[1]
-                ),
+        if not (
+            isinstance(area, list)
+            and [_is_number(a) for a in area] == [True, True]
+            and 0 < area[0] < area[1]
+        ):
+            raise LiexError(
                 f"{origin}: [view] area is [smallest, largest], two rising positive numbers, got "
-                f"{area}",
-            ),
-        )
+                f"{area}"
+            )
         lengths = {
             "behind_mm": _BEHIND_MM * relative_size,
             "smooth_mm": _SMOOTH_MM * relative_size,
@@ -119,13 +109,8 @@ class CameraView:
         }
         for key, usual in lengths.items():
             value = table.get(key, usual)
-            refuse(
-                LiexError,
-                (
-                    not (_is_number(value) and value > 0),
-                    f"{origin}: [view] {key} is a positive number of mm, got {value!r}",
-                ),
-            )
+            if not (_is_number(value) and value > 0):
+                raise LiexError(f"{origin}: [view] {key} is a positive number of mm, got {value!r}")
             lengths[key] = float(value)
         stated = {key: table[key] for key in ("frame", "foreground") if key in table}
         return CameraView(
@@ -230,42 +215,27 @@ class Skeleton:
         )
         rows = [_parsed_joint(joint, k, origin) for k, joint in enumerate(joints or [])]
         names, named_parents, offset, rest, free, limits_deg = zip(*rows, strict=True)
-        refuse(
-            LiexError,
-            (
-                named_parents[0],
-                f"{origin}: the first joint is the base and has no parent, got "
-                f"'{named_parents[0]}'",
-            ),
-        )
-        for k, parent in enumerate(named_parents[1:], start=1):
-            refuse(
-                LiexError,
-                (
-                    parent not in names[:k],
-                    f"{origin}: the parent '{parent}' of '{names[k]}' must be a joint listed "
-                    "before it",
-                ),
+        if named_parents[0]:
+            raise LiexError(
+                f"{origin}: the first joint is the base and has no parent, got '{named_parents[0]}'"
             )
+        for k, parent in enumerate(named_parents[1:], start=1):
+            if parent not in names[:k]:
+                raise LiexError(
+                    f"{origin}: the parent '{parent}' of '{names[k]}' must be a joint listed "
+                    "before it"
+                )
         parents = [-1, *(names.index(parent) for parent in named_parents[1:])]
-        refuse(
-            LiexError,
-            (
-                len(set(names)) != len(names),
-                f"{origin}: two joints have the same name; every joint needs its own",
-            ),
-        )
+        if len(set(names)) != len(names):
+            raise LiexError(f"{origin}: two joints have the same name; every joint needs its own")
         axes = np.array(free, bool)
         axes[0] = True
         offsets = np.array(offset, float)
         relative_size = round(float(_reach(parents, offsets).max()) / REFERENCE_MM, 6)
-        refuse(
-            LiexError,
-            (
-                not 0.0 < relative_size < math.inf,
-                f"{origin}: a skeleton needs a second joint at some distance from the first one",
-            ),
-        )
+        if not 0.0 < relative_size < math.inf:
+            raise LiexError(
+                f"{origin}: a skeleton needs a second joint at some distance from the first one"
+            )
         return Skeleton(
             name=table["name"],
             names=names,
@@ -349,14 +319,11 @@ def _with_mesh(table: dict[str, Any], path: Path) -> dict[str, Any]:
 
     name = surface["mesh"]
     unit_mm = surface.get("mesh_unit_mm", 1.0)
-    refuse(
-        LiexError,
-        (
-            not isinstance(name, str) or not (_is_number(unit_mm) and unit_mm > 0),
+    if not isinstance(name, str) or not (_is_number(unit_mm) and unit_mm > 0):
+        raise LiexError(
             f"{path}: [surface] mesh is the name of a file and mesh_unit_mm the mm that one of its "
-            f"units is long, got {name!r} and {unit_mm!r}",
-        ),
-    )
+            f"units is long, got {name!r} and {unit_mm!r}"
+        )
     others = {key: value for key, value in surface.items() if key not in ("mesh", "mesh_unit_mm")}
     return table | {"surface": others | read_mesh(path.parent / name, float(unit_mm), str(path))}
 
@@ -383,33 +350,22 @@ def _parsed_joint(table: dict[str, Any], index: int, origin: str) -> _Joint:
         raise LiexError(f"{origin}: joint {index} has no name")
     where = f"{origin}: joint '{name}'"
     for key in table:
-        refuse(
-            LiexError,
-            (
-                key not in _JOINT_KEYS,
-                f"{where} has an unknown key '{key}'; use {', '.join(sorted(_JOINT_KEYS))}",
-            ),
-        )
+        if key not in _JOINT_KEYS:
+            raise LiexError(
+                f"{where} has an unknown key '{key}'; use {', '.join(sorted(_JOINT_KEYS))}"
+            )
     axes = table.get("axes", [])
-    refuse(
-        LiexError,
-        (
-            not isinstance(axes, list) or any(axis not in AXES for axis in axes),
-            f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}",
-        ),
-    )
+    if not isinstance(axes, list) or any(axis not in AXES for axis in axes):
+        raise LiexError(f"{where}: axes is a list out of {', '.join(AXES)}, got {axes}")
     limits_deg = table.get("limits_deg", {})
     usual = {axis: [-180.0, 180.0] if axis in axes else [0.0, 0.0] for axis in AXES}
     limits = (
         [limits_deg.get(axis, usual[axis]) for axis in AXES] if isinstance(limits_deg, dict) else []
     )
-    refuse(
-        LiexError,
-        (
-            len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits),
-            f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}",
-        ),
-    )
+    if len(limits) != len(AXES) or not all(_is_range(pair) for pair in limits):
+        raise LiexError(
+            f"{where}: limits_deg gives [lowest, highest] degrees for each axis, got {limits_deg}"
+        )
     return (
         name,
         table.get("parent", ""),
@@ -429,13 +385,8 @@ def _is_range(pair: Any) -> bool:
 
 
 def _triple(value: Any, where: str) -> list[float]:
-    refuse(
-        LiexError,
-        (
-            not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) for x in value),
-            f"{where} is a list of three numbers, got {value}",
-        ),
-    )
+    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) for x in value):
+        raise LiexError(f"{where} is a list of three numbers, got {value}")
     return [float(x) for x in value]
 
 
@@ -462,13 +413,10 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
     Raises:
         LiexError: there is no such file, no Open3D, or no triangles in it.
     """
-    refuse(
-        LiexError,
-        (
-            not path.is_file(),
-            f"{origin}: [surface] mesh should be a file next to the TOML, but there is no {path}",
-        ),
-    )
+    if not path.is_file():
+        raise LiexError(
+            f"{origin}: [surface] mesh should be a file next to the TOML, but there is no {path}"
+        )
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -484,12 +432,9 @@ def read_mesh(path: Path, unit_mm: float, origin: str) -> dict[str, Any]:
         mesh.remove_unreferenced_vertices()
     vertices = np.asarray(mesh.vertices) * unit_mm
     faces = np.asarray(mesh.triangles)
-    refuse(
-        LiexError,
-        (
-            len(faces) < 4 or not np.isfinite(vertices).all(),
+    if len(faces) < 4 or not np.isfinite(vertices).all():
+        raise LiexError(
             f"{origin}: [surface] mesh should be a file with the triangles of a body, but {path} "
-            f"contains {len(faces)} of them; export it as STL, OBJ or PLY",
-        ),
-    )
+            f"contains {len(faces)} of them; export it as STL, OBJ or PLY"
+        )
     return {"vertices_mm": np.round(vertices, 3).tolist(), "faces": faces.tolist()}

@@ -15,7 +15,7 @@ from liex_lab.body._skinning_kernels import TAIL_RINGS
 from liex_lab.body.pose import Pose, aim
 from liex_lab.body.shape import Body, BodyShape, Capsules, MeshBody, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import LiexError, refuse
+from liex_lab.errors import LiexError
 from liex_lab.geometry import so3
 from liex_lab.runtime.memory import Rows
 
@@ -26,13 +26,8 @@ _WILD_SHARE = 0.6
 
 
 def _check_family(family: str) -> None:
-    refuse(
-        LiexError,
-        (
-            family not in FAMILIES,
-            f"there is no shape family '{family}'; choose one of {', '.join(FAMILIES)}",
-        ),
-    )
+    if family not in FAMILIES:
+        raise LiexError(f"there is no shape family '{family}'; choose one of {', '.join(FAMILIES)}")
 
 
 def _waves(rng: np.random.Generator, along: Array, n: int, deviation: float) -> Array:

@@ -98,29 +98,14 @@ def check_roots(roots: NDArray[Any], is_leaf: NDArray[np.bool_]) -> None:
         ValueError: the error, as a part of a sentence.
     """
     n = len(is_leaf)
-    refuse(
-        ValueError,
-        (
-            roots.ndim != 1 or roots.dtype.kind != "i" or not len(roots),
-            "its roots are not a list of integers",
-        ),
-    )
+    if roots.ndim != 1 or roots.dtype.kind != "i" or not len(roots):
+        raise ValueError("its roots are not a list of integers")
     starts = np.append(roots.astype(np.int64), n)
-    refuse(
-        ValueError,
-        (
-            starts[0] != 0 or not (np.diff(starts) > 0).all(),
-            f"its roots do not rise from 0 to its {n} nodes",
-        ),
-    )
+    if starts[0] != 0 or not (np.diff(starts) > 0).all():
+        raise ValueError(f"its roots do not rise from 0 to its {n} nodes")
     leaves = np.add.reduceat(is_leaf, roots.astype(np.int64), dtype=np.int64)
-    refuse(
-        ValueError,
-        (
-            not np.array_equal(2 * leaves - 1, np.diff(starts)),
-            "its nodes do not form complete trees",
-        ),
-    )
+    if not np.array_equal(2 * leaves - 1, np.diff(starts)):
+        raise ValueError("its nodes do not form complete trees")
 
 
 def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) -> None:
@@ -172,19 +157,14 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
     )
     tests = nodes[at, 3]
     kind = tests & 3
-    refuse(
-        ValueError,
-        (kind.max(initial=0) > max(TWO_PROBES, ONE_PROBE, SCALAR), "a test is of an unknown kind"),
-    )
+    if kind.max(initial=0) > max(TWO_PROBES, ONE_PROBE, SCALAR):
+        raise ValueError("a test is of an unknown kind")
     scalar = kind == SCALAR
     most = [tests.max(where=each, initial=-1) >> 2 for each in (~scalar, scalar)]
-    refuse(
-        ValueError,
-        (
-            tests.min(initial=0) < 0 or most[0] >= n_views or most[1] >= n_scalars,
-            f"a test reads more than the {n_views} views and {n_scalars} scalars there are",
-        ),
-    )
+    if tests.min(initial=0) < 0 or most[0] >= n_views or most[1] >= n_scalars:
+        raise ValueError(
+            f"a test reads more than the {n_views} views and {n_scalars} scalars there are"
+        )
 
 
 def check_samples(forest: Forest, samples: Samples) -> None:
@@ -199,14 +179,11 @@ def check_samples(forest: Forest, samples: Samples) -> None:
     """
     n_views, n_scalars = forest.reads
     width = samples.views.shape[1], samples.scalars.shape[1]
-    refuse(
-        ValueError,
-        (
-            width[0] < n_views or width[1] < n_scalars,
+    if width[0] < n_views or width[1] < n_scalars:
+        raise ValueError(
             f"the forest reads {n_views} views and {n_scalars} scalars, but its samples have "
-            f"{width[0]} and {width[1]}; use samples of the kind that it was trained on",
-        ),
-    )
+            f"{width[0]} and {width[1]}; use samples of the kind that it was trained on"
+        )
 
 
 @dataclass(frozen=True)

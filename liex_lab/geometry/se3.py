@@ -19,7 +19,6 @@ from typing import overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from liex_lab.errors import refuse
 from liex_lab.geometry import so3
 from liex_lab.runtime.memory import Rows
 
@@ -179,13 +178,10 @@ def brownian_ends(start: SE3, steps: ArrayLike, delta: float, time: float) -> SE
     """
     z = np.asarray(steps, float)
     n_steps = z.shape[1]
-    refuse(
-        ValueError,
-        (
-            not delta > 0 or not 0 <= time <= n_steps * delta * (1 + 1e-12),
-            f"the time must lie within the paths, 0 to {n_steps * delta} s, got {time} s",
-        ),
-    )
+    if not delta > 0 or not 0 <= time <= n_steps * delta * (1 + 1e-12):
+        raise ValueError(
+            f"the time must lie within the paths, 0 to {n_steps * delta} s, got {time} s"
+        )
     end = start
     for k in range(n_steps):
         spent = min(max(time - k * delta, 0.0), delta)

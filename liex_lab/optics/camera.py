@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from liex_lab.errors import LiexError, refuse
+from liex_lab.errors import LiexError
 
 Array = NDArray[np.float64]
 
@@ -56,17 +56,12 @@ class Distortion:
 
     def __post_init__(self) -> None:
         n = _N_COEFFICIENTS.get(self.model)
-        refuse(
-            LiexError,
-            (
-                n is None
-                or len(self.coefficients) != n
-                or not np.isfinite(self.coefficients).all(),
+        if n is None or len(self.coefficients) != n or not np.isfinite(self.coefficients).all():
+            raise LiexError(
                 "a lens distortion is brown_conrady with 8 finite coefficients or kannala_brandt "
                 f"with 4, got {self.model} with {list(self.coefficients)}; correct distortion in "
-                "camera.toml or in the plan",
-            ),
-        )
+                "camera.toml or in the plan"
+            )
 
     @staticmethod
     def of(model: str, coefficients: Sequence[float]) -> Distortion | None:
@@ -84,24 +79,18 @@ class Distortion:
         name = model.strip().lower().replace("-", "_").replace(" ", "_")
         if not any(values):
             return None
-        refuse(
-            LiexError,
-            (
-                name not in _MODELS,
+        if name not in _MODELS:
+            raise LiexError(
                 f"the lens distortion model '{model}' is not supported; state it as plumb_bob, "
                 "rational_polynomial or equidistant, or set all its coefficients to 0 if it is "
-                "negligible",
-            ),
-        )
+                "negligible"
+            )
         n = _N_COEFFICIENTS[_MODELS[name]]
-        refuse(
-            LiexError,
-            (
-                any(values[n:]),
+        if any(values[n:]):
+            raise LiexError(
                 f"the lens distortion model '{model}' has up to {n} coefficients here, got "
-                f"{len(values)}: {values}; calibrate the lens with fewer, or omit the others",
-            ),
-        )
+                f"{len(values)}: {values}; calibrate the lens with fewer, or omit the others"
+            )
         return Distortion(_MODELS[name], tuple((values + [0.0] * n)[:n]))
 
     @cached_property
@@ -227,19 +216,14 @@ class Lens:
     distortion: Distortion | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        refuse(
-            LiexError,
-            (
-                not (
-                    self.fx > 0
-                    and self.fy > 0
-                    and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
-                ),
+        if not (
+            self.fx > 0 and self.fy > 0 and np.isfinite([self.fx, self.fy, self.cx, self.cy]).all()
+        ):
+            raise LiexError(
                 f"focal lengths are positive pixels, got fx={self.fx}, fy={self.fy}, cx={self.cx}, "
                 f"cy={self.cy}; correct them in camera.toml or with --set camera.fx=... --set "
-                "camera.fy=...",
-            ),
-        )
+                "camera.fy=..."
+            )
 
 
 @dataclass(frozen=True)
@@ -265,14 +249,11 @@ class Camera(Lens):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        refuse(
-            LiexError,
-            (
-                not (self.width > 0 and self.height > 0),
+        if not (self.width > 0 and self.height > 0):
+            raise LiexError(
                 f"an image has at least one pixel, got {self.width} x {self.height}; correct "
-                "width and height in camera.toml",
-            ),
-        )
+                "width and height in camera.toml"
+            )
 
     def project(self, p_camera: ArrayLike) -> Array:
         """Pixels of points; NaN behind the lens.
@@ -399,14 +380,11 @@ def preset(name: str, width: int, height: int) -> Camera:
     Raises:
         LiexError: there is no such name, or that camera has no images of this size.
     """
-    refuse(
-        LiexError,
-        (
-            name not in PRESETS,
+    if name not in PRESETS:
+        raise LiexError(
             f"camera.preset is one of {', '.join(PRESETS)}, got '{name}'; choose one of them, or "
-            "state fx, fy, cx and cy",
-        ),
-    )
+            "state fx, fy, cx and cy"
+        )
     cameras = PRESETS[name]
     for camera in cameras:
         if (camera.width, camera.height) == (width, height):
@@ -599,15 +577,12 @@ class Water:
         possible = (
             self.height_mm > 0 and self.refractive_index >= 1 and np.abs(numbers[2:]).max() < 1.2
         )
-        refuse(
-            LiexError,
-            (
-                not (possible and np.isfinite(numbers).all() and self.ranging in RANGINGS),
+        if not (possible and np.isfinite(numbers).all() and self.ranging in RANGINGS):
+            raise LiexError(
                 "a water surface has a positive height_mm below the lens, a "
                 "refractive_index of at least 1, tilts below 1.2 rad and ranging "
-                f"{', '.join(RANGINGS)}, got {asdict(self)}; correct [water] in the plan",
-            ),
-        )
+                f"{', '.join(RANGINGS)}, got {asdict(self)}; correct [water] in the plan"
+            )
 
     @property
     def normal(self) -> Array:

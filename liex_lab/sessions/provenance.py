@@ -483,7 +483,8 @@ def read_document(path: Path) -> dict[str, Any]:
         if "\\u" in text:
             json.dumps(found, ensure_ascii=False).encode()  # fails for half of a character
             nul = re.search(r"(?<!\\)(?:\\\\)*\\u0000", text)
-            refuse(ValueError, (nul, "it holds a NUL character"))
+            if nul:
+                raise ValueError("it holds a NUL character")
     except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
         why = first_error(error) if isinstance(error, ValidationError) else str(error)
         raise SessionError(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import LiexError, refuse
+from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
@@ -468,13 +468,8 @@ def planned(
     Raises:
         LiexError: there is no split of this name.
     """
-    refuse(
-        LiexError,
-        (
-            name not in (*splits, SEALED),
-            f"there is no split '{name}'; known are {', '.join(splits)}",
-        ),
-    )
+    if name not in (*splits, SEALED):
+        raise LiexError(f"there is no split '{name}'; known are {', '.join(splits)}")
     for k in range(n_sessions):
         kind = split_of(name, k)
         seed, family, noise, erosion_px, object_share = splits[kind]

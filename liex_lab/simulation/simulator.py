@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import RecordingError, refuse
+from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
@@ -245,10 +245,8 @@ def tracking_sequence(
     Raises:
         RecordingError: there is no such sequence, or none of this animal.
     """
-    refuse(
-        RecordingError,
-        (name not in SEQUENCES, f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}"),
-    )
+    if name not in SEQUENCES:
+        raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
     if isinstance(world, HandSimulator):
         sensor, step_ns, floats = sensor or NYU_SENSOR, FRAME_NS, True
     else:
@@ -369,14 +367,11 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
         RecordingError: the kind, a setting or its value is invalid, or the animal is missing.
     """
     kind, _, query = address.removeprefix("synthetic:").partition("?")
-    refuse(
-        RecordingError,
-        (
-            kind not in _KINDS,
+    if kind not in _KINDS:
+        raise RecordingError(
             f"{address} is no virtual recording; the kinds are {', '.join(_KINDS)}, as in "
-            f"{_EXAMPLE}",
-        ),
-    )
+            f"{_EXAMPLE}"
+        )
     stated = dict(parse_qsl(query, keep_blank_values=True))
     session: Recording
     if kind == "scene":
@@ -384,14 +379,11 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     else:
         usual = "mouse" if kind in _SEQUENCES else ""
         animal = _ANIMALS.get(kind) or stated.pop("animal", usual)
-        refuse(
-            RecordingError,
-            (
-                not animal,
+        if not animal:
+            raise RecordingError(
                 f"{address} lacks the animal that moves, as in "
-                "synthetic:move?animal=snake.toml&seed=3",
-            ),
-        )
+                "synthetic:move?animal=snake.toml&seed=3"
+            )
         skeleton = Skeleton.load(animal)
         world = world_of(skeleton)
         values = _values(address, stated, _settings(kind, skeleton.length))
@@ -427,14 +419,11 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
     settings["build"] = (str, lambda build: build in _BUILDS, f"one of {', '.join(_BUILDS)}")
     values = _values(address, stated, settings)
     seed = values.pop("seed", 0)
-    refuse(
-        RecordingError,
-        (
-            seed >= SEALED_FROM,
+    if seed >= SEALED_FROM:
+        raise RecordingError(
             f"{address}: seeds from {SEALED_FROM} on are kept for `liex evaluate scenes --sealed`; "
-            "take a smaller one",
-        ),
-    )
+            "take a smaller one"
+        )
     family = values.pop("build", _BUILDS[0])
     return film(named, seed, values.pop("frames", 300), family=family, **values)
 
@@ -453,13 +442,10 @@ def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting])
             values[key] = read(text)
         except (KeyError, ValueError):
             values[key] = None
-        refuse(
-            RecordingError,
-            (
-                values[key] is None or not holds(values[key]),
-                f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}",
-            ),
-        )
+        if values[key] is None or not holds(values[key]):
+            raise RecordingError(
+                f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}"
+            )
     return values
 
 

@@ -23,7 +23,7 @@ from liex_lab.body._skinning_kernels import CAPSULE_RINGS, CAPSULE_SEGMENTS, joi
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.variation import N_ARM_CAPSULES, HandShape, arm_vertices, draw_hands, forearms
-from liex_lab.errors import LiexError, refuse
+from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3, so3
 from liex_lab.recordings.formats.images.nyu import (
     LABEL_CAMERA,
@@ -206,14 +206,11 @@ def find_reference() -> Path | None:
     """
     if stated := os.environ.get(VARIABLE):
         folder = Path(stated)
-        refuse(
-            LiexError,
-            (
-                not (folder / REFERENCE_FILE).is_file(),
+        if not (folder / REFERENCE_FILE).is_file():
+            raise LiexError(
                 f"{VARIABLE} should name a folder with {REFERENCE_FILE}, labels of NYU hands, but "
-                f"{folder} holds none; name another one, or unset it",
-            ),
-        )
+                f"{folder} holds none; name another one, or unset it"
+            )
         return folder
     folder = _REPOSITORY.parent / "shared" / "data" / "hand_nyu"
     return folder if (folder / REFERENCE_FILE).is_file() else None

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import RecordingError, refuse
+from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.hand.simulator import HandSimulator
 from liex_lab.simulation.locomotion import moving_session
@@ -463,10 +463,8 @@ def film(
     Raises:
         RecordingError: there is no such scene.
     """
-    refuse(
-        RecordingError,
-        (name not in SCENES, f"there is no scene '{name}'; known are {', '.join(SCENES)}"),
-    )
+    if name not in SCENES:
+        raise RecordingError(f"there is no scene '{name}'; known are {', '.join(SCENES)}")
     title = f"scene-{name}-{seed}"
     if name in RECIPES:
         making = Making(RECIPES[name], seed, n_frames, sensor, family, spine_mm)
