@@ -293,8 +293,7 @@ def skin_tubes(
     rotations,
     girth,
     stations,
-    half_width,
-    half_height,
+    half_mm,
     power,
     blobs,
     tail,
@@ -310,8 +309,7 @@ def skin_tubes(
         rotations: (n, J, 3, 3) of their joints.
         girth: (n,) multiplies all lengths of the shape.
         stations: (R,) shares of the spine's length, shared.
-        half_width: (n, R) mm.
-        half_height: (n, R) mm.
+        half_mm: (2, n, R) half widths and half heights, mm.
         power: (n,) of the superellipses.
         blobs: (n, B, 6) ellipsoids.
         tail: (n, 3) length, radius at the rump, radius at the tip.
@@ -330,8 +328,8 @@ def skin_tubes(
             arc,
             girth[i],
             stations,
-            half_width[i],
-            half_height[i],
+            half_mm[0, i],
+            half_mm[1, i],
             power[i],
             frame,
             out[i],

@@ -469,8 +469,7 @@ class MeshBody(Body):
             self.carriers,
             self.bones,
             self.weight,
-            self.along,
-            self.across,
+            np.stack([self.along, self.across]),
             body.width,
             out,
         )
@@ -486,14 +485,16 @@ def _skin_mesh(
     carrier,
     bones,
     weight,
-    along,
-    across,
+    offsets,
     width,
     out,
     start,
     stop,
 ):
-    """Linear blend skinning of a batch into out (n, V, 3); (V, B) arrays as in `MeshBody`."""
+    """Linear blend skinning of a batch into out (n, V, 3); (V, B) arrays as in `MeshBody`.
+
+    offsets: (2, V, B, 3) along and across.
+    """
     for i in range(start, stop):
         for v in range(len(weight)):
             for axis in range(3):
@@ -505,7 +506,7 @@ def _skin_mesh(
                     total = positions[i, j, axis]
                     for k in range(3):
                         total += rotations[i, j, axis, k] * (
-                            scale[i] * along[v, b, k] + thick * across[v, b, k]
+                            scale[i] * offsets[0, v, b, k] + thick * offsets[1, v, b, k]
                         )
                     out[i, v, axis] += weight[v, b] * total
 
@@ -666,8 +667,7 @@ class Surface:
                 rotations,
                 across,
                 self.stations,
-                tube.half_width,
-                tube.half_height,
+                np.stack([tube.half_width, tube.half_height]),
                 tube.power,
                 tube.blobs,
                 tube.tail,
