@@ -12,6 +12,7 @@ Depth is float32, measured along the optical axis (z of the camera frame, not ra
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -91,6 +92,43 @@ def unread_where_damaged(
         return np.zeros(shape, np.float32)
 
     return read_depth
+
+
+def side_by_side(frames: Iterable[DepthFrame], n_frames: int) -> list[DepthFrame]:
+    """Up to n frames of one size, the depth of each copied into one array as it arrives.
+
+    Args:
+        frames: their source, of which these are taken.
+        n_frames: maximum number of frames.
+    """
+    taken: list[DepthFrame] = []
+    block: Depth = np.empty(0, np.float32)
+    for frame in islice(frames, n_frames):
+        if not taken:
+            block = np.empty((n_frames, *frame.depth.shape), np.float32)
+        block[len(taken)] = frame.depth
+        taken.append(replace(frame, depth=block[len(taken)]))
+    return taken
+
+
+def stacked(frames: Sequence[DepthFrame]) -> Depth:
+    """Depth (n, H, W) of frames of one size, mm; without a copy if they lie `side_by_side`.
+
+    Args:
+        frames: at least one. The result may share their memory; do not write to it.
+    """
+    block, depth = frames[0].depth.base, frames[0].depth
+    if isinstance(block, np.ndarray) and (block.shape[1:], block.dtype) == (
+        depth.shape,
+        depth.dtype,
+    ):
+        rows = block[: len(frames)]
+        if len(rows) == len(frames) and all(
+            frame.depth.base is block and frame.depth.ctypes.data == row.ctypes.data
+            for frame, row in zip(frames, rows, strict=True)
+        ):
+            return rows
+    return np.stack([frame.depth for frame in frames])
 
 
 def has_readings(depth: Depth) -> bool:

@@ -12,7 +12,6 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.frame import Depth, DepthFrame, marked, region_mask
+from liex_lab.recordings.frame import Depth, DepthFrame, marked, region_mask, side_by_side
 from liex_lab.recordings.timestamps import (
     FAULTS,
     JUMPED,
@@ -379,7 +378,7 @@ class Recording:
         if n_frames < 1:
             raise ValueError(f"a chunk has at least one frame, got {n_frames}")
         frames = self.frames(first, stop)
-        yield from iter(lambda: list(islice(frames, n_frames)), [])
+        yield from iter(lambda: side_by_side(frames, n_frames), [])
 
     def __getitem__(self, part: slice) -> Recording:
         """Some of the frames as a recording of its own, with rows counted from 0.

@@ -19,7 +19,7 @@ from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.session_shape import ShapePrior
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.recordings.frame import DepthFrame, has_readings
+from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
 from liex_lab.runtime.memory import Allocator
 from liex_lab.runtime.processes import threads
 from liex_lab.scene.background import has_noise
@@ -193,7 +193,7 @@ class FrameTracker:
         Returns:
             Observations of n frames, arena frame.
         """
-        depths = np.stack([frame.depth for frame in frames])
+        depths = stacked(frames)
         times = np.array([frame.time_ns for frame in frames], np.int64)
         observed = Observations.empty(self.estimator.skeleton, times)
         observed.has_depth[:] = [has_readings(depth) for depth in depths]
