@@ -162,7 +162,7 @@ def serve_dashboard(
     *,
     host: str = "127.0.0.1",
     port: int = 8050,
-    told: Callable[[str], None] = print,
+    echo: Callable[[str], None] = print,
     progress: Progress = silent,
 ) -> None:
     """Serve a study, or a folder that contains sessions, to browsers until interrupted.
@@ -174,7 +174,7 @@ def serve_dashboard(
         study: a study file, its folder, or a folder that contains sessions.
         host: the network address to listen on; the default is this machine alone.
         port: the port to listen on.
-        told: called with the dashboard's address once it is served.
+        echo: called with the dashboard's address once it is served.
         progress: receives progress while sessions are loaded.
 
     Raises:
@@ -216,4 +216,4 @@ def serve_dashboard(
         reviews=place / REVIEWS,
         regions=StatedRegions(study),
     )
-    serve(app, host, port, lambda found: told(address(host, found, token)))
+    serve(app, host, port, lambda found: echo(address(host, found, token)))

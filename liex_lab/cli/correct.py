@@ -10,7 +10,7 @@ import typer
 
 import liex_lab
 from liex_lab import api
-from liex_lab.cli.options import SessionPath, command_group, print_table, say
+from liex_lab.cli.options import SessionPath, command_group, echo, print_table
 from liex_lab.errors import SessionError
 from liex_lab.runtime.progress import progress_bar
 
@@ -41,7 +41,7 @@ def flip(
     by: Author = "",
 ) -> None:
     """Exchange head and tail in a time span."""
-    _say(session, ["flip", start_s, stop_s], by)
+    _parse_and_apply(session, ["flip", start_s, stop_s], by)
 
 
 @correct.command()
@@ -66,7 +66,7 @@ def joint(
         raise SessionError(
             "a joint's place is given in one way: --to-mm X Y Z in the arena, or --to-px U V"
         )
-    _say(session, ["joint", name, frame, *(to_px or to_mm or ())], by)
+    _parse_and_apply(session, ["joint", name, frame, *(to_px or to_mm or ())], by)
 
 
 @correct.command()
@@ -109,13 +109,13 @@ def bout(
 
             _do(session, labelled_bouts(_opened(session), api.read_any_labels(labels)), by)
         case (None, str(), float(), float(), False, None):
-            _say(session, ["add", action, start_s, stop_s, *new], by)
+            _parse_and_apply(session, ["add", action, start_s, stop_s, *new], by)
         case (float(), str(), None, None, False, None):
-            _say(session, ["rename", at_s, action, *new], by)
+            _parse_and_apply(session, ["rename", at_s, action, *new], by)
         case (float(), None, float(), float(), False, None):
-            _say(session, ["recut", at_s, start_s, stop_s], by)
+            _parse_and_apply(session, ["recut", at_s, start_s, stop_s], by)
         case (float(), None, None, None, True, None):
-            _say(session, ["delete", at_s], by)
+            _parse_and_apply(session, ["delete", at_s], by)
         case _:
             raise SessionError(
                 "one edit at a time: --at S with --action, with --from and --to, or with "
@@ -131,7 +131,7 @@ def list_corrections(session: SessionPath) -> None:
     opened = liex_lab.Session.open(session, raw=True)
     log = read_log(opened.path)
     if not log.entries:
-        say(f"{opened.path} has no corrections")
+        echo(f"{opened.path} has no corrections")
         return
     standing = {entry.number for entry in log.standing}
     rows = []
@@ -148,7 +148,7 @@ def list_corrections(session: SessionPath) -> None:
         )
     print_table(rows, "", "what", "by", "at", "")
     if log.standing and not applies(log, opened.path, opened.metadata):
-        say(
+        echo(
             "note: they were made on another measurement of this recording and are not applied; "
             f"`liex correct apply` applies them, and without the folder {FOLDER} they are gone"
         )
@@ -185,7 +185,7 @@ def redo(session: SessionPath, by: Author = "") -> None:
         )
     number, what = redoable
     _do(session, [], by, [number])
-    say(f"again:     {what}")
+    echo(f"again:     {what}")
 
 
 @correct.command()
@@ -216,15 +216,15 @@ def describe(
     with progress_bar() as progress:
         api.describe_session(session, given, author=by, progress=progress)
     for key, value in given.items():
-        say(f"described: {key} is {value or 'not known'}")
-    say(f"report:    {session / 'report.html'}")
+        echo(f"described: {key} is {value or 'not known'}")
+    echo(f"report:    {session / 'report.html'}")
 
 
 def _opened(session: Path) -> liex_lab.Session:
     return liex_lab.Session.open(session)
 
 
-def _say(session: Path, sentence: Sequence[object], by: str) -> None:
+def _parse_and_apply(session: Path, sentence: Sequence[object], by: str) -> None:
     from liex_lab.sessions.correcting import parse_correction
 
     _do(session, [parse_correction(_opened(session), sentence)], by)
@@ -236,10 +236,10 @@ def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] 
     with progress_bar() as progress:
         api.correct_session(session, what, undo=undo, author=by, progress=progress)
     for one in what[:5]:
-        say(f"corrected: {one}")
+        echo(f"corrected: {one}")
     for sentence in disagreements(_opened(session)):
-        say(f"note:      {sentence}")
+        echo(f"note:      {sentence}")
     if len(what) > 5:
-        say(f"corrected: {len(what) - 5} further bouts")
-    say(f"tables:    {session / 'corrected'}")
-    say(f"report:    {session / 'report.html'}")
+        echo(f"corrected: {len(what) - 5} further bouts")
+    echo(f"tables:    {session / 'corrected'}")
+    echo(f"report:    {session / 'report.html'}")

@@ -33,11 +33,11 @@ from liex_lab.cli.options import (
     TopicName,
     WhichPlan,
     command_group,
+    echo,
     load_plan,
     print_numbers,
     print_table,
     region_setting,
-    say,
     to_json,
 )
 from liex_lab.cli.sessions import (
@@ -90,7 +90,7 @@ for command, section in (
 
 def _version(wanted: bool) -> None:
     if wanted:
-        say(f"liex_lab {liex_lab.__version__}")
+        echo(f"liex_lab {liex_lab.__version__}")
         raise typer.Exit()
 
 
@@ -177,7 +177,7 @@ def run(
         raise typer.Exit(_print_session(measured))
     codes = [0]
     for one in measured:
-        say(f"arena {one.name}")
+        echo(f"arena {one.name}")
         if one.error is not None:
             typer.secho(f"liex: {printable(one.error)}", fg=typer.colors.RED, err=True)
             codes.append(one.error.exit_code)
@@ -227,7 +227,7 @@ def doctor(
             progress=progress,
         )
     if as_json:
-        say(to_json(findings))
+        echo(to_json(findings))
     else:
         api.print_report(findings, verbose)
 
@@ -299,12 +299,12 @@ def live(
         )
     print_numbers(result, json_file)
     if not result["n_live"]:
-        say(
+        echo(
             "no latency: frames that came while background, floor and size were learned were still "
             "being made up for when the recording was over"
         )
     if to.endswith(".rrd"):
-        say(f"replay: {to}; Rerun's viewer opens it: rerun {to}")
+        echo(f"replay: {to}; Rerun's viewer opens it: rerun {to}")
 
 
 @app.command(rich_help_panel=MODELS)
@@ -334,7 +334,7 @@ def info(
             facts[f"model {name}"] = f"sha256 {str(card.get('sha256', 'unknown'))[:16]}"
     print_numbers(facts)
     if not everything:
-        say("`liex info --all` lists every package and how the models were made")
+        echo("`liex info --all` lists every package and how the models were made")
 
 
 def main() -> None:
@@ -386,17 +386,17 @@ def _print_session(session: Path, further: str = "") -> int:
     from liex_lab.sessions.folder import folder_bytes, megabytes, taken_from
     from liex_lab.sessions.verdict import read_verdict
 
-    say(f"session: {session}")
+    echo(f"session: {session}")
     if copy := taken_from(session):
-        say(f"note: the corrections of {copy} were taken over; see `liex correct list`")
+        echo(f"note: the corrections of {copy} were taken over; see `liex correct list`")
     report = session / "report.html"
     if report.is_file():
-        say(f"report:  {report}")
-        say(f"figures: {session / 'figures'}")
-    say(f"replay:  liex show {shlex.quote(str(session))}")
-    say(f"on disk: {megabytes(folder_bytes(session))}")
+        echo(f"report:  {report}")
+        echo(f"figures: {session / 'figures'}")
+    echo(f"replay:  liex show {shlex.quote(str(session))}")
+    echo(f"on disk: {megabytes(folder_bytes(session))}")
     if further:
-        say(further)
+        echo(further)
     verdict = read_verdict(session)
     if verdict["sentence"]:
         typer.secho(

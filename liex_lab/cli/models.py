@@ -16,10 +16,10 @@ from liex_lab.cli.options import (
     SessionPath,
     VariantName,
     command_group,
+    echo,
     print_numbers,
     print_rows,
     print_scores,
-    say,
     write_numbers,
 )
 from liex_lab.dashboards.paper.published import DEVIATIONS, HAND
@@ -118,7 +118,7 @@ def train(
         if json_file is not None:
             write_numbers(report, json_file)
         print_scores(report)
-    say(f"{what}: {made}")
+    echo(f"{what}: {made}")
 
 
 # `liex evaluate`: reproduces every published number.
@@ -318,7 +318,7 @@ def evaluate_tables(
             progress=progress,
         )
     for path in written:
-        say(path)
+        echo(path)
 
 
 @benchmark("actions")

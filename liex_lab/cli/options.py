@@ -100,7 +100,7 @@ def load_plan(plan: str | None, settings: Sequence[str]) -> liex_lab.Plan:
     return liex_lab.Plan.load(plan or "mouse").with_settings(settings)
 
 
-def say(text: object) -> None:
+def echo(text: object) -> None:
     """Print a line, with unprintable characters escaped."""
     typer.echo(printable(text))
 
@@ -131,7 +131,7 @@ def print_rows(rows: dict[str, dict[str, Any]]) -> None:
     lines = [["", *(name.replace("_", " ") for name in columns)], ["---"] * (len(columns) + 1)]
     lines += [[name, *(_cell(row.get(column)) for column in columns)] for name, row in rows.items()]
     for line in lines:
-        say(f"| {' | '.join(line)} |")
+        echo(f"| {' | '.join(line)} |")
 
 
 def _cell(value: Any) -> str:

@@ -26,9 +26,9 @@ from liex_lab.cli.options import (
     Settings,
     TopicName,
     WhichPlan,
+    echo,
     load_plan,
     region_setting,
-    say,
 )
 from liex_lab.errors import LiexError, MisfitError, printable
 from liex_lab.runtime.progress import progress_bar
@@ -89,16 +89,16 @@ def compare(
         if not isnan(row["effect_size"]):  # identical values have none
             numbers += f", g {row['effect_size']:.2g}"
         if not isnan(row["estimate"]):
-            say(f"{row['measure']}, {row['contrast']}: {numbers}; {counted_units(row)}")
+            echo(f"{row['measure']}, {row['contrast']}: {numbers}; {counted_units(row)}")
         if row["test"]:
-            say(f"    p {row['p']:.2g}, corrected {row['p_fdr']:.2g}: {row['test']}")
+            echo(f"    p {row['p']:.2g}, corrected {row['p_fdr']:.2g}: {row['test']}")
         else:
             refused.setdefault(row["refused"], []).append(row["measure"])
     for why, names in refused.items():  # once, not for each measure
-        say(f"not tested: {', '.join(dict.fromkeys(names))}\n    {why}")
-    say(found["sessions"])
-    say(f"tables: {found['folder']}   (sentences to paste: results.txt, methods.txt)")
-    say(f"figures: {counted(len(found['figures']), 'file')} in {found['folder'] / 'figures'}")
+        echo(f"not tested: {', '.join(dict.fromkeys(names))}\n    {why}")
+    echo(found["sessions"])
+    echo(f"tables: {found['folder']}   (sentences to paste: results.txt, methods.txt)")
+    echo(f"figures: {counted(len(found['figures']), 'file')} in {found['folder'] / 'figures'}")
     for one in found["check"]:
         typer.secho(f"check this result: {printable(one)}", fg=typer.colors.YELLOW)
     if found["check"]:
@@ -111,7 +111,7 @@ def report(
     """Regenerate a session's report.html, with all corrections."""
     from liex_lab.dashboards.report.report import write_report
 
-    say(f"report: {write_report(session)}")
+    echo(f"report: {write_report(session)}")
 
 
 def figures(
@@ -146,8 +146,8 @@ def figures(
             place, only=only or (), formats=formats or ("svg", "pdf"), out=out, progress=progress
         )
     if found["empty"]:
-        say(f"note: there is nothing to draw of {', '.join(found['empty'])}")
-    say(f"figures: {counted(len(found['files']), 'file')} in {found['folder']}")
+        echo(f"note: there is nothing to draw of {', '.join(found['empty'])}")
+    echo(f"figures: {counted(len(found['files']), 'file')} in {found['folder']}")
 
 
 def export(
@@ -206,14 +206,14 @@ def export(
                 overwrite=overwrite,
                 progress=progress,
             )
-        say(f"export: {video}")
+        echo(f"export: {video}")
         return
     if actions or groups or start_s is not None or stop_s is not None or slower != 1.0:
         raise typer.BadParameter(
             "actions, groups and times are chosen for `--to video`; the other formats hold all"
         )
     for place in places:
-        say(f"export: {job(liex_lab.Session.open(place), to, out, overwrite=overwrite)}")
+        echo(f"export: {job(liex_lab.Session.open(place), to, out, overwrite=overwrite)}")
 
 
 # The command `liex show`: a session's replay in Rerun, optionally with full depth images.
@@ -275,8 +275,8 @@ def _whole_depth(session: Path, scratch: Path, recording: str | None) -> list[Pa
         with progress_bar() as progress:
             return [api.whole_images(session, scratch / "depth.rrd", recording, progress)]
     except LiexError as error:
-        say(f"note: {error}")
-        say("note: the replay shows what the session keeps of the depth")
+        echo(f"note: {error}")
+        echo("note: the replay shows what the session keeps of the depth")
         return []
 
 
@@ -291,13 +291,13 @@ def _show(replay: Path, more: list[Path], at_s: float | None, web: bool) -> None
     # RERUN_ANALYTICS: no usage data leaves the laboratory; the viewer in a browser ignores it
     hosted: list[str] = []
     if web:
-        say(
+        echo(
             "Rerun's viewer in the browser calls tel.rerun.io, its makers' count of uses; the "
             "window does not"
         )
         page, data = _free_ports(2)
         source = quote(f"rerun+http://{_HERE}:{data}/proxy", safe="")
-        say(f"replay: http://{_HERE}:{page}?url={source}   (Ctrl+C ends it)")
+        echo(f"replay: http://{_HERE}:{page}?url={source}   (Ctrl+C ends it)")
         hosted = ["--web-viewer", "--web-viewer-port", str(page), "--port", str(data)]
     command = own_python(
         "-m", "rerun", *[str(file) for file in replays_with(replay, more)], "--bind", _HERE, *hosted
@@ -354,9 +354,9 @@ def convert(
             overwrite=overwrite,
             progress=progress,
         )
-    say(f"recording: {done.path} ({done.n_frames} frames)")
+    echo(f"recording: {done.path} ({done.n_frames} frames)")
     for sentence in (*done.problems, *done.notes):
-        say(f"note: {sentence}")
+        echo(f"note: {sentence}")
 
 
 def pack(
@@ -419,21 +419,21 @@ def pack(
             progress=progress,
         )
     if not done.written:
-        say(f"archive: {done.path} ({done.n_frames} frames) is as it was packed")
+        echo(f"archive: {done.path} ({done.n_frames} frames) is as it was packed")
         return
     n_bytes = done.path.stat().st_size
     size = f"{n_bytes / 1e6:.1f} MB"
     if done.source_bytes:
         share = 100 * n_bytes / done.source_bytes
         size += f", {share:.0f}% of the recording's {done.source_bytes / 1e6:.1f} MB"
-    say(f"archive: {done.path} ({done.n_frames} frames, {size})")
-    say(f"kept:    {100 * done.kept:.0f}% of an image's pixels, bit for bit")
+    echo(f"archive: {done.path} ({done.n_frames} frames, {size})")
+    echo(f"kept:    {100 * done.kept:.0f}% of an image's pixels, bit for bit")
     if done.verified:
-        say("checked: every image and time equals the recording's")
+        echo("checked: every image and time equals the recording's")
     for path in done.deleted:
-        say(f"removed: {path}")
+        echo(f"removed: {path}")
     for sentence in (*done.problems, *done.notes):
-        say(f"note: {sentence}")
+        echo(f"note: {sentence}")
 
 
 # The commands of `liex` for studies.
@@ -476,8 +476,8 @@ def cohort(
     """Measure the pending sessions of a study; exits with code 3 if a session failed."""
     if study == "init":
         with progress_bar() as progress:
-            file = api.begin_study(folder or Path(), overwrite, say=say, progress=progress)
-        say(f"study: {file}")
+            file = api.begin_study(folder or Path(), overwrite, echo=echo, progress=progress)
+        echo(f"study: {file}")
         return
     if folder is not None:
         raise typer.BadParameter(
@@ -487,8 +487,8 @@ def cohort(
         from liex_lab.pipelines.study.cluster import is_encrypted
 
         if not is_encrypted(scheduler):
-            say(f"what goes to and from {scheduler} is not encrypted, and each side runs what the")
-            say("other sends: a scheduler for a network that you trust, or tls://")
+            echo(f"what goes to and from {scheduler} is not encrypted, and each side runs what the")
+            echo("other sends: a scheduler for a network that you trust, or tls://")
     standings = api.run_study(
         study,
         workers=workers,
@@ -500,7 +500,7 @@ def cohort(
         dry_run=dry_run,
     )
     if _print_study(standings, dry_run):
-        say(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
+        echo(f"to try what failed again: liex cohort {shlex.quote(study)} --retry")
         # the exit code of a study in which a session failed
         raise typer.Exit(3)
 
@@ -526,12 +526,12 @@ def dashboard(
 
         def announce(address: str) -> None:
             """Print the dashboard's `address`, and open it if requested."""
-            say(f"dashboard: {address}   (Ctrl+C ends it)")
+            echo(f"dashboard: {address}   (Ctrl+C ends it)")
             if open_browser:  # by a file: other accounts can read a program's arguments
                 folder = stack.enter_context(TemporaryDirectory(prefix="liex-"))
                 webbrowser.open(page_that_opens(address, Path(folder)).as_uri())
 
-        api.serve_dashboard(study, host=host, port=port, told=announce, progress=progress)
+        api.serve_dashboard(study, host=host, port=port, echo=announce, progress=progress)
 
 
 def page_that_opens(address: str, folder: Path) -> Path:
@@ -557,7 +557,7 @@ def verify(
     with progress_bar() as progress:
         findings = api.verify_session(session, recording, progress=progress)
     for finding in findings:
-        say(f"{finding.state:6}{finding.sentence}")
+        echo(f"{finding.state:6}{finding.sentence}")
     if any(finding.state == "wrong" for finding in findings):
         raise typer.Exit(1)
 
@@ -576,16 +576,16 @@ def _print_study(standings: list[SessionStatus], all_of_them: bool) -> int:
             gone = (
                 f"there is no recording {one.session.recording}; correct its path, or copy it there"
             )
-            say(f"{'missing':9}{one.session.id}  {gone}")
+            echo(f"{'missing':9}{one.session.id}  {gone}")
         elif one.state == "done" and one.reason:
-            say(f"{'done':9}{one.session.id}  {one.reason}")
+            echo(f"{'done':9}{one.session.id}  {one.reason}")
         elif all_of_them or one.state not in ("done", "excluded"):
             remedy = f"; {one.failure['remedy']}" if one.failure and one.state == "failed" else ""
-            say(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
+            echo(f"{one.state:9}{one.session.id}  {one.reason}{remedy}".rstrip())
     remarks = [one.session.remark for one in standings if one.state not in ("failed", "excluded")]
     for remark in dict.fromkeys(filter(None, [*remarks, *to_check(standings)])):
-        say(remark)
-    say(
+        echo(remark)
+    echo(
         f"{len(standings)} session{'' if len(standings) == 1 else 's'}: "
         + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
     )

@@ -132,17 +132,20 @@ class Board:
     """
 
     def __init__(
-        self, n_jobs: int, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+        self,
+        n_jobs: int,
+        write_line: Callable[[str], None],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Create a board on which no job has begun.
 
         Args:
             n_jobs: total number of jobs.
-            say: prints a line.
+            write_line: prints a line.
             clock: monotonic clock, s.
         """
         self._n = n_jobs
-        self._say = say
+        self._write_line = write_line
         self._clock = clock
         self._began = clock()
         self._running: dict[str, float] = {}  # job -> completed fraction
@@ -172,7 +175,7 @@ class Board:
         self.n_failed = self.n_failed + failed
         left = self.left_s
         wait = f", about {_span(left)} left" if left is not None and self.n_ended < self._n else ""
-        self._say(f"{self.n_ended} of {self._n}: {name} {sentence}{wait}")
+        self._write_line(f"{self.n_ended} of {self._n}: {name} {sentence}{wait}")
 
     @property
     def share(self) -> float:

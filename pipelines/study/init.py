@@ -35,7 +35,7 @@ _MOST_LISTED = 4  # sessions of an animal
 Named = tuple[str, str, Path, str]  # animal, session, recording, origin of the animal's name
 _HEADER = """\
 # A study of liex_lab: which animals, in which groups, recorded in which sessions. Correct what is wrong here, then
-#     liex cohort {file} --dry-run      says what will be done, and why
+#     liex cohort {file} --dry-run      shows what will be done, and why
 #     liex cohort {file}                does it, goes on after any interruption, and leaves out what is done
 # Paths count from this file's folder and stay in it. Nothing is ever written into {raw}.
 # [set], and `set` of an animal or a session, change values of the plan: set = {{ animal.spine_mm = 65 }}
@@ -64,7 +64,7 @@ def begin_study(
     folder: str | Path,
     overwrite: bool = False,
     *,
-    say: Callable[[str], object] = lambda _: None,
+    echo: Callable[[str], object] = lambda _: None,
     progress: Progress = silent,
 ) -> Path:
     """Write FOLDER/study.toml with every recording below FOLDER/rawdata, or else below FOLDER.
@@ -72,7 +72,7 @@ def begin_study(
     Args:
         folder: the study's folder.
         overwrite: replace an existing study file.
-        say: called with each line of a summary: the animals with their sessions, and notes to
+        echo: called with each line of a summary: the animals with their sessions, and notes to
             check.
         progress: called recording by recording.
 
@@ -88,12 +88,11 @@ def begin_study(
         StudyError,
         (
             not root.is_dir(),
-            f"a study begins in a folder with recordings, but {root} is none; check the path",
+            f"{root} is not a folder; a study begins in a folder with recordings",
         ),
         (
             file.exists() and not overwrite,
-            f"{file} exists already; change it by hand, or say "
-            "--overwrite (in Python overwrite=True)",
+            f"{file} exists already; edit it, or use --overwrite (in Python overwrite=True)",
         ),
     )
     raw = root / RAW if (root / RAW).is_dir() else root
@@ -105,7 +104,7 @@ def begin_study(
     twins = find_twins(found)
     stated: dict[Path, str] = {}
     for path in (one for one in found if one not in twins):
-        progress(len(stated), len(found) - len(twins), "reading who the animals are")
+        progress(len(stated), len(found) - len(twins), "reading subjects")
         stated[path] = stated_subject(path, progress)
     named, notes = name_sessions(stated, raw)
     notes += [
@@ -116,7 +115,7 @@ def begin_study(
     write_whole(file, _text(root, named, notes))
     Study.load(file)
     for line in (*_listed(named), *notes):
-        say(line)
+        echo(line)
     return file
 
 

@@ -366,7 +366,7 @@ def test_the_token_is_new_each_time_on_this_machine_as_elsewhere(
     monkeypatch.setattr(StudyData, "warm", lambda self, progress: None)
     said: list[str] = []
     for host in ("127.0.0.1", "0.0.0.0", "0.0.0.0"):
-        api.serve_dashboard(study, host=host, port=5, told=said.append)
+        api.serve_dashboard(study, host=host, port=5, echo=said.append)
     assert [how["alone"] for how in made] == [True, False, False]
     assert made[0]["show_replay"] is not None
     assert len({how["token"] for how in made}) == 3

@@ -68,7 +68,7 @@ def test_recordings_under_any_names_become_sessions_of_their_own(tmp_path: Path)
 def test_a_folder_without_recordings_is_told(tmp_path: Path) -> None:
     with pytest.raises(StudyError, match="no recording"):
         begin_study(tmp_path)
-    with pytest.raises(StudyError, match="is none"):
+    with pytest.raises(StudyError, match="is not a folder"):
         begin_study(tmp_path / "none")
     assert not list(tmp_path.iterdir())
     assert find_recordings(tmp_path) == []
@@ -208,7 +208,7 @@ def test_a_placeholder_in_metadata_is_no_animal(tmp_path: Path) -> None:
 def test_metadata_and_name_that_disagree_are_told(tmp_path: Path) -> None:
     moseq(tmp_path, "m01_day1", "m07")
     said: list[str] = []
-    begin_study(tmp_path, say=said.append)
+    begin_study(tmp_path, echo=said.append)
     assert "m01_day1: its metadata name the animal m07 and its file name m01" in said
 
 
@@ -222,7 +222,7 @@ def test_the_same_recording_is_listed_once(tmp_path: Path) -> None:
     (raw / "m03_day1.oni").write_text("four")
     (raw / "m03_day1.mcap").write_text("the same in another container")
     said: list[str] = []
-    study = Study.load(begin_study(tmp_path, say=said.append))
+    study = Study.load(begin_study(tmp_path, echo=said.append))
     assert len(study.sessions) == 4
     for left_out in ("session_1.tar.gz", "copy of m02.mcap", "m03_day1.mcap"):
         assert any(

@@ -1,7 +1,7 @@
-"""The picture in README.md: some of the report's own figures, rendered by a headless browser.
+"""The figure in README.md: some of the report's own figures, rendered by a headless browser.
 
-After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` makes it again, and
-`python docs/pictures.py` all pictures of README.md.
+After `liex demo`, `photograph("mouse_walk.liex", "dashboards/assets/demo.png")` renders it
+again, and `python docs/render_images.py` renders every image of README.md.
 """
 
 from __future__ import annotations

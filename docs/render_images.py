@@ -1,7 +1,7 @@
-"""The pictures of README.md and of the manual's pages, made again: `python docs/pictures.py`.
+"""Render the images of README.md and of the manual: `python docs/render_images.py`.
 
-It measures the bundled sample and some virtual animals, and needs a Chromium and, for the replay,
-Vulkan (.ci/run says which packages).
+It measures the bundled sample and some virtual animals. It needs Chromium and, for the replay,
+Vulkan; .ci/run lists the packages.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import cv2
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from readme_picture import photograph
+from readme_figure import photograph
 
 import liex_lab
 from liex_lab.api import run_demo, run_session
@@ -39,12 +39,12 @@ ANIMALS = (
 
 
 def save_small(path: Path, rgb: Any, n_colours: int = 96) -> None:
-    """Write a picture with few colours, so that a clone stays small.
+    """Write a PNG with a small palette, so that a clone stays small.
 
     Args:
         path: the PNG.
         rgb: (H, W, 3) uint8.
-        n_colours: of its palette.
+        n_colours: size of its palette.
     """
     from PIL import Image
 
@@ -115,8 +115,8 @@ def draw_examples(folder: Path) -> None:
         figure = plt.figure(plt.get_fignums()[0])
         figure.set_dpi(100)
         figure.canvas.draw()
-        picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
-        save_small(STATIC / f"{script.stem}.png", picture, 32)
+        rgb = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # type: ignore[attr-defined]
+        save_small(STATIC / f"{script.stem}.png", rgb, 32)
 
 
 def shoot_replay(session: Path, moment: int = 120) -> None:
@@ -140,7 +140,7 @@ def shoot_replay(session: Path, moment: int = 120) -> None:
         headless=True, port=port, hide_welcome_screen=True, executable_path=program
     ) as viewer:
         viewer.open(str(session / "session.rrd"))
-        for _ in range(5):  # chunks load on demand: the first pictures may be incomplete
+        for _ in range(5):  # chunks load on demand: the first screenshots may be incomplete
             viewer.set_time("frame", sequence=moment, play_state="paused")
             png = viewer.take_screenshot()
             time.sleep(0.7)
@@ -162,8 +162,8 @@ def shoot_pages(session: Path, at_s: float = 3.9) -> None:
     served = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert served.stdout is not None
-        told = re.search(r"(http://[^/]+)/\S*", served.stdout.readline())
-        assert told is not None
+        address = re.search(r"(http://[^/]+)/\S*", served.stdout.readline())
+        assert address is not None
         with sync_playwright() as driver:
             browser = driver.chromium.launch(
                 executable_path=shutil.which("chromium"), args=["--no-sandbox"]
@@ -172,8 +172,8 @@ def shoot_pages(session: Path, at_s: float = 3.9) -> None:
             page.set_default_timeout(120_000)
             page.goto((session / "report.html").as_uri())
             page.screenshot(path=STATIC / "report.png")  # all colours: every action has its own
-            page.goto(told[0])  # with the token, which is a cookie from then on
-            page.goto(f"{told[1]}/session/{session.stem}?t={at_s}")
+            page.goto(address[0])  # with the token, which is a cookie from then on
+            page.goto(f"{address[1]}/session/{session.stem}?t={at_s}")
             page.wait_for_selector("#desk.is-open")
             page.wait_for_load_state("networkidle")
             page.wait_for_timeout(2000)  # the view glides to the animal
