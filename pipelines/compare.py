@@ -18,7 +18,7 @@ from liex_lab.dashboards.figures import sets
 from liex_lab.behaviour.cohort import (
     ENGINES,
     STATS,
-    WHO,
+    SUBJECT,
     collect,
     compare,
     methods,
@@ -312,12 +312,12 @@ def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
         ) from None
     if (
         "subject_id" not in stated
-        or not set(stated.columns) & set(WHO[1:])
+        or not set(stated.columns) & set(SUBJECT[1:])
         or stated["subject_id"].duplicated().any()
     ):
         raise SessionError(
             f"{path} should have a column subject_id, each animal once, and any of "
-            f"{', '.join(WHO[1:])}; it has {', '.join(map(str, stated.columns))}"
+            f"{', '.join(SUBJECT[1:])}; it has {', '.join(map(str, stated.columns))}"
         )
     known = stated.set_index("subject_id")
     if unknown := sorted(set(table["subject_id"].astype(str)) - set(known.index)):
@@ -325,5 +325,5 @@ def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
             f"{path} does not list the animal '{unknown[0]}' of the sessions; add a row for it"
         )
     return table.assign(
-        **{name: table["subject_id"].map(known[name]) for name in WHO[1:] if name in known}
+        **{name: table["subject_id"].map(known[name]) for name in SUBJECT[1:] if name in known}
     )

@@ -23,7 +23,7 @@ from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import LOG, corrected_folder
-from liex_lab.sessions.verdict import WHO, Entry
+from liex_lab.sessions.verdict import SUBJECT, Entry
 
 from ..figures.animals import Recent
 from ..report.report import warnings
@@ -133,7 +133,7 @@ class StudyData:
         rows = [
             {
                 "session": entry.key,
-                **{name: entry.who.get(name, "") for name in WHO},
+                **{name: entry.subject.get(name, "") for name in SUBJECT},
                 "state": entry.state,
                 "reason": entry.reason,
                 "remedy": entry.remedy,
@@ -141,7 +141,9 @@ class StudyData:
             }
             for entry in self.entries.values()
         ]
-        return pd.DataFrame(rows, columns=["session", *WHO, "state", "reason", "remedy", *QUALITY])
+        return pd.DataFrame(
+            rows, columns=["session", *SUBJECT, "state", "reason", "remedy", *QUALITY]
+        )
 
     def ethograms(self, keys: Iterable[str]) -> dict[str, SessionBouts]:
         """The ethograms of measured sessions by key; unreadable ones are left out."""
@@ -155,16 +157,16 @@ class StudyData:
         sentences on possible mistakes in their names.
         """
         measured = self._measured()
-        state = [(entry.key, self._facts[entry.key][0], entry.who) for entry, _ in measured]
+        state = [(entry.key, self._facts[entry.key][0], entry.subject) for entry, _ in measured]
         with self._lock:
             if self._whole is not None and self._whole[0] == state:
                 return self._whole[1]
         tables = [
-            facts["summary"].assign(key=entry.key, **{k: v for k, v in entry.who.items() if v})
+            facts["summary"].assign(key=entry.key, **{k: v for k, v in entry.subject.items() if v})
             for entry, facts in measured
             if isinstance(facts["summary"], pd.DataFrame)
         ]
-        whole = pd.DataFrame(columns=["key", "session_id", *WHO])
+        whole = pd.DataFrame(columns=["key", "session_id", *SUBJECT])
         if tables:
             whole, notes = cohort.unified(pd.concat(tables, ignore_index=True))
             whole.attrs["check"] = notes

@@ -324,7 +324,7 @@ def _flip_status(flip: dict[str, Any]) -> str:
     """The status of a row of the table `flips`, in words."""
     if flip["source"] == "human":
         undone = isinstance(flip.get("undone_at"), str) and flip["undone_at"]
-        return "were exchanged by a person, who took it back" if undone else "exchanged by a person"
+        return "exchanged by a person and reverted" if undone else "exchanged by a person"
     return "were exchanged and are corrected" if flip["applied"] else "perhaps exchanged"
 
 

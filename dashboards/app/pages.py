@@ -265,7 +265,7 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
     """The variables of the ethogram page, for the requested groups and sessions."""
     names = request.args.getlist("group")
     chosen = request.args.getlist("session")
-    group_of = {entry.key: entry.who.get("group", "") for entry in data.done}
+    group_of = {entry.key: entry.subject.get("group", "") for entry in data.done}
     keys = [key for key in group_of if key in chosen]  # sessions take precedence over groups
     if not chosen:
         keys = sorted(
@@ -440,9 +440,9 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
         SessionError: the session cannot be opened.
     """
     session = data.session(key)
-    who = data.entries[key].who
+    subject = data.entries[key].subject
     frames = session.metadata["frames"]
-    stated = [f"{name.replace('_', ' ')} {value}" for name, value in who.items() if value]
+    stated = [f"{name.replace('_', ' ')} {value}" for name, value in subject.items() if value]
     extent = f"{frames['n_frames']:,} frames, {frames['duration_s']:.1f} s"
     path = quote(key, safe="")
     kinds = dict.fromkeys(mark.kind for mark in scene_marks(session))
@@ -453,7 +453,7 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
     files += [(f"{name}.svg", f"/figure/{path}/{name}.svg") for name in sets.OF_SESSION]
     return {
         "key": key,
-        "group": who.get("group", ""),
+        "group": subject.get("group", ""),
         "headline": f"{', '.join(stated)} · {extent}" if stated else extent,
         "warnings": warnings(session),
         "author": author_name(),

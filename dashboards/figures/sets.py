@@ -14,7 +14,7 @@ import pandas as pd
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
-from liex_lab.behaviour.cohort import WHO
+from liex_lab.behaviour.cohort import SUBJECT
 from liex_lab.errors import SessionError
 from liex_lab.plan.study import references_first
 from liex_lab.runtime.durable import inside, replacing, safe_name, unlinked
@@ -228,7 +228,7 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
         SessionError: its files are missing or damaged.
     """
     try:
-        table = read_harmless(folder / "sessions.csv", ("session_id", "individual", *WHO))
+        table = read_harmless(folder / "sessions.csv", ("session_id", "individual", *SUBJECT))
         stats = pd.read_parquet(folder / "stats.parquet")
         document = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))
         places = [folder / str(place) for place in document["sessions"]]
@@ -329,8 +329,8 @@ def _arena(session: Session) -> Figure | None:
 
 def _grouped(sessions: Sequence[Session], table: pd.DataFrame) -> list[SessionAnimal]:
     """The animals with their groups in a comparison; animals without a group are left out."""
-    who = ["session_id", "individual"]
-    named = table.astype(dict.fromkeys(who, str)).groupby(who)["group"]
+    keys = ["session_id", "individual"]
+    named = table.astype(dict.fromkeys(keys, str)).groupby(keys)["group"]
     stated = {key: list(groups_of) for key, groups_of in named}
     every = [animal for session in sessions for animal in session_animals(session)]
     there = Counter((animal.session.name, animal.individual) for animal in every)

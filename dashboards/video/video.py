@@ -32,7 +32,7 @@ def h264() -> str:
     """The name of an available H.264 encoder of PyAV.
 
     Raises:
-        SessionError: there is none.
+        SessionError: no H.264 encoder is available.
     """
     for name in _CODECS:
         try:

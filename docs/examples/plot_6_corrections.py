@@ -46,8 +46,8 @@ plt.show()
 corrected.bouts[["action", "start_s", "stop_s", "source"]]
 
 # %%
-# The log holds who, when and what. The measured tables are still there (``raw=True``), and what was
-# done can be undone by its number.
+# Each log entry has an author, a time and the correction. ``raw=True`` opens the measured tables.
+# Undo an entry by its number.
 for entry in corrected.log.entries:
     print(entry.number, entry.author, type(entry.what).__name__)
 correct_session(copy, undo=[entry.number for entry in corrected.log.entries])

@@ -44,7 +44,7 @@ from liex_lab.tables.schema import shown, table_columns, titled, to_pandas
 if TYPE_CHECKING:
     from liex_lab.tables.schema import SessionTables
 
-WHO = ("subject_id", "group", "cage", "sex", "batch")
+SUBJECT = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")
 _ESTIMATES = ("estimate", "ci_low", "ci_high")
 _EFFECTS = ("effect_size", "effect_low", "effect_high")
@@ -77,7 +77,7 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
         .assign(n_bouts=len(session.table("bouts", ["action"])))
         for session in sessions
     ]
-    return pd.concat(rows or [pd.DataFrame(columns=["session_id", *WHO])], ignore_index=True)
+    return pd.concat(rows or [pd.DataFrame(columns=["session_id", *SUBJECT])], ignore_index=True)
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
@@ -112,7 +112,7 @@ def compare(
     """The table `stats`: every measure and pair of groups with effect size, interval, p and n.
 
     Args:
-        table: one row per session, see `collect`; missing columns of `WHO` count as unknown.
+        table: one row per session, see `collect`; missing columns of `SUBJECT` count as unknown.
         measures: columns of `table` to compare; a missing one is refused in its row.
         reference: compare each group with this one only; None compares all pairs of groups.
         engine: permutation, mixed, or auto, which uses the mixed model if the units are nested,
@@ -130,7 +130,7 @@ def compare(
     """
     texts = {
         name: table[name].fillna("").astype(str) if name in table else ""
-        for name in (*WHO, *blocks)
+        for name in (*SUBJECT, *blocks)
     }
     table = unified(table.assign(**texts))[0]
     groups = references_first(set(table["group"]) - {""})
@@ -152,13 +152,13 @@ def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
     """The table with one spelling of names that differ only in capitals, spaces, _ or -.
 
     Args:
-        table: one row per session, see `collect`; its columns of `WHO` are read.
+        table: one row per session, see `collect`; its columns of `SUBJECT` are read.
 
     Returns:
         The table, and notes on such names and on animals that may be the same.
     """
     notes = []
-    for column in (name for name in WHO if name in table):
+    for column in (name for name in SUBJECT if name in table):
         for kept, *others in alike(table[column].fillna("").astype(str)):
             notes.append(f"{column} {', '.join(map(repr, others))} is taken for {kept!r}")
             table = table.assign(**{column: table[column].replace(others, kept)})

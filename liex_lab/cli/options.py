@@ -62,7 +62,7 @@ JsonFile = Annotated[
 
 
 def region_setting(region: str | None) -> list[str]:
-    """The plan setting of a region; empty if there is none.
+    """The plan setting of a region; empty if absent.
 
     Args:
         region: "x,y x,y x,y", the corners of a polygon, or "circle x,y radius"; a final word mm

@@ -257,8 +257,8 @@ def show(
     replay = liex_lab.Session.open(session).path / "session.rrd"
     if at_s is None and not web and not has_screen():
         raise LiexError(
-            f"Rerun needs a screen and there is none here; open {replay} on a computer with a "
-            "screen, or add --web"
+            f"Rerun needs a screen, and this computer has no screen; open {replay} on another "
+            "computer, or add --web"
         )
     with tempfile.TemporaryDirectory(prefix="liex-show-") as scratch:
         _show(

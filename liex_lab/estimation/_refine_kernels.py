@@ -97,7 +97,7 @@ def nearest_reading(heights, r, c, known):
         r: row of the pixel.
         c: column of the pixel.
         known: (S, S, 2) int32 cache, -1 if not searched yet; known[r, c] is set to the row and
-            column found, row -2 if there is none.
+            column found, row -2 if absent.
     """
     if known[r, c, 0] != -1:
         return

@@ -17,7 +17,7 @@ from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.errors import PlanError
 from liex_lab.forests.grow import GrowthPlan
 
-Number = Annotated[float, Field(ge=-1e12, le=1e12)]  # NaN is none
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]  # excludes NaN
 Count = Annotated[int, Field(strict=True, ge=0, le=10_000)]
 
 

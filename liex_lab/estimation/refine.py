@@ -483,7 +483,7 @@ def both_directions(
 
     Returns:
         The index (n,) of the best candidate; the index (n,) of the best one in the opposite
-        direction; the difference (n,) of its score, infinite or NaN if there is none; and (n, K)
+        direction; the difference (n,) of its score, infinite or NaN if absent; and (n, K)
         bool, the candidates in the opposite direction.
     """
     rows = np.arange(len(scores))

@@ -9,8 +9,8 @@ rotations use the chordal mean, the polar projection of sum_i w_i R_i, or follow
 joints. A boosted forest then predicts the mean joint error of the chosen pose from its scores, its
 spread and the posture (the "expectation forest", ours).
 
-Candidates are moved by forests trained on initial poses; their weighted mean is none of them and
-has errors of its own. A small forest, grown by stochastic gradient boosting (Friedman 2002) on
+Candidates are moved by forests trained on initial poses; their weighted mean is a new pose
+with errors of its own. A small forest, grown by stochastic gradient boosting (Friedman 2002) on
 chosen poses of images that no other tree was grown on, predicts the residual x_j - x_j_hat of every
 joint j, in the base's frame, at home size, and corrects its predictable part (the "forest
 correction", ours). It is evaluated for one pose per frame, at negligible cost.

@@ -70,7 +70,7 @@ def _actions(session: Session, estimate: Any, catalogue: Any, observed: Any) -> 
     )
     table.add_column("score", "how well the bout fits its action, 0 to 1")
     # not `source`, which is a link in ndx-ethogram
-    table.add_column("named_by", "who named it: rule, model or human")
+    table.add_column("named_by", "source of the name: rule, model or human")
     columns = ("start_s", "stop_s", "action", "score", "source")
     for start, stop, word, score, source in zip(*(bouts[name] for name in columns), strict=True):
         table.add_row(

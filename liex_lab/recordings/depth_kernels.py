@@ -41,7 +41,7 @@ def look_up(depth, source, out):
 
     Args:
         depth: (h, w) float32 mm.
-        source: (H, W) int32, row * w + column in `depth`; -1 if there is none.
+        source: (H, W) int32, row * w + column in `depth`; -1 if absent.
         out: (H, W) float32 mm, written; 0 where source is -1.
     """
     stored = depth.ravel()

@@ -166,7 +166,7 @@ def lookup_table(camera: Camera) -> NDArray[np.int32]:
         camera: the camera with distortion.
 
     Returns:
-        (H', W') int32, row * width + column in the distorted image; -1 if there is none.
+        (H', W') int32, row * width + column in the distorted image; -1 if absent.
     """
     straight = straight_camera(camera)
     pixels = np.floor(camera.project(straight.unproject(_pixels(straight), 1.0)) + 0.5)

@@ -207,7 +207,7 @@ def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
     """Reasons why the times of a recording are unreliable.
 
     Args:
-        step_ns: the median step, ns; 0 if there is none.
+        step_ns: the median step, ns; 0 if absent.
         faults: (n,) uint8 index into `FAULTS`, as in `MonotoneTimes.faults`.
 
     Returns:

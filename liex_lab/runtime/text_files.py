@@ -259,7 +259,7 @@ def read_harmless(path: Path, texts: tuple[str, ...] = ()) -> pd.DataFrame:
 
     Args:
         path: the file.
-        texts: columns that are text even if they look like numbers.
+        texts: columns that are text even if they parse as numbers.
     """
     import pandas as pd
 
@@ -293,7 +293,7 @@ def _is_number(cell: str) -> bool:
 
 
 def value_at(table: Any, path: Sequence[str]) -> Any:
-    """The value at a path of keys in nested tables; None where there is none."""
+    """The value at a path of keys in nested tables; None if absent."""
     for part in path:
         table = table.get(part) if isinstance(table, dict) else None
     return table

@@ -22,7 +22,7 @@ from pydantic.dataclasses import dataclass
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError, one_line, refuse
 from liex_lab.runtime.durable import safe_name
-from liex_lab.sessions.verdict import ALSO, WHO
+from liex_lab.sessions.verdict import ALSO, SUBJECT
 
 FOLDER = "corrected"
 LOG = "corrections.json"
@@ -37,7 +37,7 @@ FACTS = {
     "corrections",
 }  # sections that may change
 START = "session_start_time"
-DESCRIBED = (*WHO, *ALSO, START)
+DESCRIBED = (*SUBJECT, *ALSO, START)
 _UNDO = "undo"
 UNREADABLE = (OSError, ValueError, KeyError, TypeError, AttributeError)  # errors of damaged JSON
 

@@ -24,7 +24,7 @@ from liex_lab.recordings.timestamps import Gap
 from liex_lab.runtime import memory, text_files
 from liex_lab.sessions.provenance import Provenance, package_version, reading_from
 from liex_lab.sessions.session import Session, spreads
-from liex_lab.sessions.verdict import WHO
+from liex_lab.sessions.verdict import SUBJECT
 from liex_lab.tables import schema as tables
 from liex_lab.tables.rows import NOT_FROM_CAMERA, Rows, median_step, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations
@@ -106,7 +106,7 @@ class Results:
         return {
             "session_id": rows.session_id,
             "individual": rows.individual,
-            **{name: origin.subject.get(name, "") for name in WHO},
+            **{name: origin.subject.get(name, "") for name in SUBJECT},
             "session_start_time": origin.session_start_time,
             "n_frames": rows.track.n_frames,
             "n_frames_observed": int(observed.sum()),

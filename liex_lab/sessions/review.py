@@ -1,5 +1,4 @@
-"""Blinded review: clips of a study in random order, labelled by raters who do not know their
-origin.
+"""Blinded review: clips of a study in random order, labelled by raters blind to origin.
 
 A review is one JSON file with the drawn clips, each rater's labels, and the program's label for the
 middle of each clip. It is rewritten, as a whole, with every answer, so that an interrupted review
@@ -112,7 +111,7 @@ class Review:
         return replace(self, answers={**self.answers, rater: own})
 
     def agreements(self) -> list[tuple[str, str, RaterAgreement]]:
-        """Agreement of every two raters who are done, and of each with the program."""
+        """Agreement between raters that have finished, and of each with the program."""
         program = {k: clip.program for k, clip in enumerate(self.clips)}
         raters = [name for name in self.answers if self.done_by(name)]
         labels = {**{name: self.answers[name] for name in raters}, PROGRAM: program}

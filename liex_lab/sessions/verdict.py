@@ -177,7 +177,7 @@ def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
 # Entry of a study's session list, shared by jobs and views.
 
 
-WHO = ("subject_id", "group", "cage", "sex", "batch")
+SUBJECT = ("subject_id", "group", "cage", "sex", "batch")
 ALSO = ("species", "age")  # also required by archives; not used for grouping
 
 
@@ -191,7 +191,7 @@ class Entry:
         reason: why it is in this state.
         remedy: how to resolve it.
         folder: the session folder; None if it was not measured.
-        who: the known ones of `WHO` (subject, group, cage, sex, batch).
+        subject: the known ones of `SUBJECT` (subject, group, cage, sex, batch).
     """
 
     key: str
@@ -199,7 +199,7 @@ class Entry:
     reason: str = ""
     remedy: str = ""
     folder: Path | None = None
-    who: dict[str, str] = field(default_factory=dict)
+    subject: dict[str, str] = field(default_factory=dict)
 
 
 def state_in_words(state: str, reason: str) -> str:

@@ -48,7 +48,7 @@ def need_screen(instead: str) -> None:
         LiexError: there is no screen.
     """
     if not has_screen():
-        raise LiexError(f"Rerun needs a screen and there is none here; {instead}")
+        raise LiexError(f"Rerun needs a screen, and this computer has no screen; {instead}")
 
 
 def replays_with(replay: Path, more: Sequence[Path] = ()) -> list[Path]:

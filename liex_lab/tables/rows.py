@@ -113,7 +113,7 @@ class Rows:
         wall, zone = self._in_arena()
         missing = self.missing_before()
         return {
-            **self._who,
+            **self._keys,
             **self._when(slice(0, track.n_frames), 1),
             "time_ns": track.times_ns,
             "gap_before": missing,
@@ -149,7 +149,7 @@ class Rows:
         track = self.track[part]
         n_joints = self.track.skeleton.n_joints
         return {
-            **self._who,
+            **self._keys,
             **self._when(part, n_joints),
             "joint": Words(
                 np.tile(np.arange(n_joints), track.n_frames), tuple(track.skeleton.names)
@@ -177,7 +177,7 @@ class Rows:
         together = np.full((*turn.shape[:2], len(ROOT_COVARIANCES)), np.nan)
         together[:, 0] = track.cov_root[:, *np.triu_indices(6, 1)]
         return {
-            **self._who,
+            **self._keys,
             **self._when(part, n_rows),
             "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
             **_xyz("w{}_rad", turn),
@@ -228,7 +228,7 @@ class Rows:
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)
         kinds = (float, float, np.int64, np.int64, np.int64, str, float, float)
         return {
-            **self._who,
+            **self._keys,
             **{n: np.array(v, k) for n, v, k in zip(names, values, kinds, strict=True)},
         }
 
@@ -242,7 +242,7 @@ class Rows:
         count = frame_count(self.frame_index)
         stops = stop_times(time)
         return {
-            **self._who,
+            **self._keys,
             "start_s": np.array([time[flip.start] for flip in flips]),
             "stop_s": np.array([stops[flip.stop - 1] for flip in flips]),
             "start_frame": np.array([count[flip.start] for flip in flips], np.int64),
@@ -270,7 +270,7 @@ class Rows:
         return found
 
     @property
-    def _who(self) -> dict[str, str]:
+    def _keys(self) -> dict[str, str]:
         return {"session_id": self.session_id, "individual": self.individual}
 
     def _when(self, part: slice, repeat: int) -> dict[str, Any]:

@@ -141,7 +141,7 @@ def fit_shape(
         why = f"shapes were learned for the bundled model of the {skeleton.name} alone"
         stated = None
     elif stated is not None and stated.labels is None:
-        why = f"of {stated.by} too few bear out another, and they share it"
+        why = f"too few of the {stated.by} support another shape, so all use the average one"
     elif stated is None and len(good) < FEWEST_FRAMES:
         why = (
             f"{len(good)} frames of the sample show the animal well, and a shape of its own is "
@@ -222,7 +222,7 @@ class SessionBody:
         log_sd: standard deviation of the logarithm of the length in single frames.
         n_frames: frames with a pose.
         girth: of the average body; unused if a shape was kept.
-        shape: (K,) labels of the kept shape, see `session_shape.labels_of`; None if there is none.
+        shape: (K,) labels of the kept shape, see `session_shape.labels_of`; None if absent.
         refused: whether held-out frames contradicted the fitted shape.
         n_good_frames: frames that show the animal well.
     """

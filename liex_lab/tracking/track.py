@@ -28,11 +28,11 @@ CORRECTED = "corrected"  # flag of a pose with manually placed joints
 FLAGS = {
     "": "a pose was measured and is trusted",
     "doubtful": (
-        "a pose was measured, but its predicted error is large for this animal, or the picture "
+        "a pose was measured, but its predicted error is large for this animal, or the image "
         "contradicts it"
     ),
     "not_found": (
-        "the frame holds depth, but nothing in it looks like the animal; the row is NaN, or bridged"
+        "the frame holds depth, but nothing in it resembles the animal; the row is NaN, or bridged"
     ),
     "hidden": (
         "the animal is behind or under something, whole or so much of it that nobody knows how it "

@@ -56,20 +56,20 @@ def list_sessions(place: str | Path) -> tuple[str, Callable[[], Sequence[verdict
         raise StudyError(
             f"there is no study {path}; name a study's .toml file, or a folder with sessions in it"
         )
-    find_sessions([path])  # raises an error if there is none
+    find_sessions([path])  # raises an error if it has no sessions
     return path.resolve().name, lambda: _of_folder(path)
 
 
 def _of_study(one: SessionStatus) -> verdict.Entry:
     session, failure = one.session, one.failure or {}
-    who = {name: getattr(session.animal, name) for name in verdict.WHO[1:]}
+    subject = {name: getattr(session.animal, name) for name in verdict.SUBJECT[1:]}
     return verdict.Entry(
         session.id,
         one.state,
         one.reason or session.remark,
         str(failure.get("remedy", "")),
         session.folder if (session.folder / "session.json").is_file() else None,
-        {"subject_id": session.animal.id, **who},
+        {"subject_id": session.animal.id, **subject},
     )
 
 
@@ -96,12 +96,14 @@ def _of_folder(path: Path) -> list[verdict.Entry]:
 def _measured(folder: Path) -> verdict.Entry:
     try:
         session = Session.open(folder)
-        known = session.table("sessions").iloc[0].reindex([*verdict.WHO]).to_dict()
+        known = session.table("sessions").iloc[0].reindex([*verdict.SUBJECT]).to_dict()
         reason = to_look_at(verdict.verdict_in(session.metadata))
     except LiexError as error:
         return verdict.Entry(folder.name, "failed", str(error))
-    who = {str(name): value for name, value in known.items() if isinstance(value, str) and value}
-    return verdict.Entry(session.name, "done", reason, folder=folder, who=who)
+    subject = {
+        str(name): value for name, value in known.items() if isinstance(value, str) and value
+    }
+    return verdict.Entry(session.name, "done", reason, folder=folder, subject=subject)
 
 
 # The study's table: every session with its status, as CSV for spreadsheets and Parquet for

@@ -76,7 +76,7 @@ def test_exchanged_ends_are_reported_in_words_and_near_ones_together(folder: Pat
         (0.5, 0.8, "head and tail were exchanged and are corrected, 2 times (p 0.99)"),
         (1.0, 1.2, "head and tail perhaps exchanged (p 0.34)"),
         (2.0, 2.5, "head and tail exchanged by a person"),
-        (3.0, 3.1, "head and tail were exchanged by a person, who took it back"),
+        (3.0, 3.1, "head and tail exchanged by a person and reverted"),
     ]
     assert {(one["kind"], one["individual"]) for one in found(folder)} == {("ends", "mouse_1")}
 

@@ -126,7 +126,7 @@ def test_ethograms_and_budgets_name_a_group_once_and_every_colour_has_a_meaning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entries = [
-        Entry(key, "done", folder=tmp_path, who={"group": group})
+        Entry(key, "done", folder=tmp_path, subject={"group": group})
         for key, group in (("a", "drug"), ("b", "drug"), ("c", "vehicle"))
     ]
     shown = StudyData("x", lambda: entries)

@@ -628,7 +628,7 @@ class HandSimulator:
         """Source of the training images, one phrase."""
         return (
             "rendered from a seed; postures partly drawn from statistics of labelled points of "
-            f"the NYU Hand Pose test frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
+            f"the NYU Hand Pose test frames 1 to {N_FIRST_PERSON}; no image of a hand was used"
         )
 
     def training_blocks(
@@ -770,7 +770,7 @@ class HandSimulator:
         return angles, turns, places, None
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> HandSession:
-        """A recording of one person who moves from gesture to gesture at 30 frames/s, with pauses.
+        """A recording of one person moving from gesture to gesture at 30 frames/s, with pauses.
 
         Args:
             seed: seed or seeds of all random numbers.
