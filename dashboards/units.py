@@ -12,8 +12,6 @@ from liex_lab.tables.schema import shown, titled
 
 __all__ = ["counted", "day", "read_as", "reading", "shown", "titled"]
 
-_DECIMALS = {"s": 2, "m": 2, "mm": 1, "cm/s": 1, "°": 1, "°/s": 1, "Hz": 1, "1/min": 1}
-
 
 def read_as(measure: str, unit: str) -> str:
     """The displayed name of a summary column, with the unit of its displayed values.
@@ -43,7 +41,9 @@ def reading(value: Any, unit: str) -> str:
         return "–"
     if float(value).is_integer() and not unit:
         return f"{value:,.0f}"
-    decimals = _DECIMALS.get(unit, 2)
+    decimals = {"s": 2, "m": 2, "mm": 1, "cm/s": 1, "°": 1, "°/s": 1, "Hz": 1, "1/min": 1}.get(
+        unit, 2
+    )
     if value:
         decimals = max(decimals, min(1 - math.floor(math.log10(abs(value))), 4))
     return f"{value:,.{decimals}f}"

@@ -32,8 +32,6 @@ from .choice import USUAL, fit_plan
 from .compiling import compile_ahead
 from .session import HEAVY, MEASURING, Prepared, check_unused, prepare, read_ahead
 
-_FACTS = ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age")
-
 
 @dataclass(frozen=True)
 class ArenaOutcome:
@@ -173,7 +171,7 @@ def arena_settings(arena: sections.SeveralArenas, name: str) -> tuple[str, ...]:
         f"arena.region={toml_value(arena.region)}",
         f"session.name={toml_value(name)}",
     ]
-    for fact in _FACTS:
+    for fact in ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age"):
         if (value := getattr(arena, fact)) is not None:
             settings.append(f"session.{fact}={toml_value(value)}")
     if arena.zones is not None:

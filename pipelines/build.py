@@ -174,9 +174,6 @@ def session_bytes(recording: Recording, plan: Plan, length_mm: float, distance_m
 # Regions that a plan states, in the images of a recording, and proposed arenas.
 
 
-_N_SAMPLED = 96
-
-
 def cut_out(recording: Recording, plan: Plan) -> Recording:
     """The recording with all but `arena.region` unread; unchanged if the plan states none.
 
@@ -243,7 +240,7 @@ def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
 def _sampled(recording: Recording, plan: Plan) -> tuple[support_plane.SampledScene, int]:
     """Frames spread over a recording with their background, and the stride of their pixels."""
     stride = stride_for(recording, animal_of(plan).spine_min_mm)
-    sample = sample_frames(recording, _N_SAMPLED, stride)
+    sample = sample_frames(recording, 96, stride)
     return sampled_scene(sample, recording.camera.every(stride), target_of(plan)), stride
 
 

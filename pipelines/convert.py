@@ -44,7 +44,6 @@ _OTHER_KINDS = re.compile(
     r"\.(bag|db3|oni|dat|tar|gz|tgz|avi|mkv|mp4|png|tiff?|jpe?g|pgm|pclzf|ply|npy|npz|h5|nwb|rrd|zip|toml|csv|json)$",
     re.I,
 )
-_PICTURE = re.compile(r"frame_\d+\.png")
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,8 @@ def _check_target(target: Path, overwrite: bool) -> None:
     others = [
         path.name
         for path in ([] if is_file else sorted(target.iterdir()))
-        if not path.is_file() or not (path.name in own or _PICTURE.fullmatch(path.name))
+        if not path.is_file()
+        or not (path.name in own or re.fullmatch(r"frame_\d+\.png", path.name))
     ]
     if others:
         raise RecordingError(
@@ -240,8 +240,6 @@ def in_place(target: Path) -> Iterator[Path]:
 
 
 Mask = NDArray[np.bool_]
-
-_WIDER = (0.0, 0.03, 0.1)  # margins that are tried around the found region, of the image's width
 
 
 def pack(
@@ -406,7 +404,8 @@ def _region(
                 "whole images are kept, for more than one object moves in them; name what is to "
                 "be kept with --region"
             ]
-        for share in _WIDER:
+        # margins that are tried around the found region, of the image's width
+        for share in (0.0, 0.03, 0.1):
             mask = _wider(region, round(share * seen.width))
             cut = seen.viewed_by(seen.camera, _within(mask), {}, lent=True)
             try:

@@ -39,8 +39,6 @@ from .session import measure_behaviour
 
 Numbers = NDArray[np.int64]  # of rows
 
-_AS_BEFORE = ("kinematics", "zones")  # tables that bout edits do not change
-
 
 def correct_session(
     session: str | Path,
@@ -160,7 +158,10 @@ def _apply(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
         results.write_track(folder)
         facts["frames"] = results.counts()
     else:
-        written = {name: table for name, table in written.items() if name not in _AS_BEFORE}
+        # tables that bout edits do not change
+        written = {
+            name: table for name, table in written.items() if name not in ("kinematics", "zones")
+        }
     results.write_measured(folder, written, behaviour.vocabulary.columns)
     facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}
     layout = replay_blueprint({**raw.metadata, **facts})

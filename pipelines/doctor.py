@@ -175,8 +175,6 @@ def next_command(
 
 _TEXT = read_toml(Path(__file__).with_name("doctor.toml"))
 FINDINGS: Final[dict[str, str]] = _TEXT["findings"]  # key of the JSON: its meaning
-# sampled frames, spread over the recording; as many as a run learns its scene from
-_N_SAMPLED = 96
 # frames compared with their predecessors, and the length of a window in a longer recording
 _N_COMPARED = 400
 _WINDOW = 8
@@ -223,7 +221,8 @@ def examine(
             misplaced.append(str(error))
             plan = plan.with_settings(["arena.region="])
         stride = stride_for(ideal, animal_of(plan).spine_min_mm)
-        sample = sample_frames(ideal, _N_SAMPLED, stride)
+        # sampled frames, spread over the recording; as many as a run learns its scene from
+        sample = sample_frames(ideal, 96, stride)
         raw = sample if ideal is opened else sample_frames(opened, 16)
         facts, unlikely, median_mm = _depth_facts(raw)
         scene: list[str] = []
@@ -402,8 +401,6 @@ def _finite(value: float) -> float | None:
 
 
 _MUCH_UNREAD = 0.2  # share of the pixels on the floor
-# sizes outside the plan's range are searched down to and up to this factor
-_WIDER = 20.0
 
 
 def scene_facts(
@@ -489,7 +486,8 @@ def _animal_facts(
         read=lambda k: sample[k],
     )
     missing = ""
-    for wider in (1.0, _WIDER):
+    # sizes outside the plan's range are searched down to and up to this factor
+    for wider in (1.0, 20.0):
         within = (sizes[0] / wider, sizes[1] * wider)
         try:
             scene, frames = learn_scene(
@@ -624,10 +622,6 @@ def _noise(sample: NDArray[np.float32], where: NDArray[np.bool_]) -> float | Non
 # Findings of `liex doctor` as lines of text.
 
 
-# lines that determine whether a run makes sense
-_FIRST = ("frames", "rate", "gaps", "intrinsics from", "floor", "arena", "animal", "plan")
-
-
 def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
     """Print the findings of `examine` on one screen, and the problems below.
 
@@ -639,7 +633,17 @@ def print_report(findings: dict[str, Any], verbose: bool = True) -> None:
 
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in lines(findings):
-        if verbose or name in _FIRST:
+        # lines that determine whether a run makes sense
+        if verbose or name in (
+            "frames",
+            "rate",
+            "gaps",
+            "intrinsics from",
+            "floor",
+            "arena",
+            "animal",
+            "plan",
+        ):
             table.add_row(name, Text(printable(value)))
     console = Console()
     console.print(table)

@@ -151,9 +151,6 @@ def export_video(
 # Whole depth images for a session's replay, `liex show --depth all`.
 
 
-_CHUNK = 32  # frames in memory at a time
-
-
 def whole_images(
     session: str | Path, out: Path, recording: str | None = None, progress: Progress = silent
 ) -> Path:
@@ -180,7 +177,8 @@ def whole_images(
     with _recording_of(opened, recording, progress) as images:
         replay = rrd.ReplayWriter(out, origin)
         try:
-            for frames in images.chunks(_CHUNK):
+            # frames in memory at a time
+            for frames in images.chunks(32):
                 replay.add(
                     [frame.index for frame in frames],
                     [frame.time_ns for frame in frames],

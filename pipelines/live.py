@@ -26,9 +26,6 @@ from liex_lab.tracking.tracker import FrameTracker
 
 from .build import build_recording, build_tracker
 
-_AT_ONCE = 16
-Viewer = Callable[[FrameTracker, streaming.Arriving], Any]
-
 
 def follow_live(
     source: str,
@@ -102,7 +99,7 @@ def track_live(
     plan: Plan,
     *,
     learn_frames: int = 90,  # to learn the background, the floor and the animal's size from
-    viewer: Viewer | None = None,
+    viewer: Callable[[FrameTracker, streaming.Arriving], Any] | None = None,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], track.Tracked]:
     """Track a recording as its frames arrive; returns latencies and the smoothed track.
@@ -189,7 +186,7 @@ def _together(arrivals: Iterator[streaming.Arrival]) -> Iterator[list[streaming.
     some: list[streaming.Arrival] = []
     for arrival in arrivals:
         some.append(arrival)
-        if len(some) == _AT_ONCE or time.perf_counter() - arrival.at_s < 0.2:
+        if len(some) == 16 or time.perf_counter() - arrival.at_s < 0.2:
             yield some
             some = []
     if some:

@@ -125,7 +125,6 @@ def _candidates(text: str, path: Keys, value: Any) -> Iterator[str]:
 
 _MOST_CORNERS = 200
 _REGION = ("arena", "region")
-_N_SAMPLED = 9  # number of sampled frames for each pixel's usual depth
 
 
 @dataclass(frozen=True)
@@ -266,7 +265,8 @@ class StatedRegions:
         if key not in self._seen:
             whole = planned.plan.with_settings(["arena.region="])
             with build_recording(planned.recording, whole) as opened:
-                sample = np.clip(np.rint(sample_frames(opened, _N_SAMPLED)), 0, 65_535)
+                # number of sampled frames for each pixel's usual depth
+                sample = np.clip(np.rint(sample_frames(opened, 9)), 0, 65_535)
                 self._seen = {key: (usual_depth(sample.astype(np.uint16)), opened.camera)}
         return self._seen[key]
 

@@ -35,7 +35,6 @@ _NEEDED = (
     "problems",
     "files",
 )
-_TABLES = (".parquet", ".csv")
 
 
 @dataclass(frozen=True)
@@ -224,7 +223,9 @@ def _again(session: Session, recording: str, progress: Progress) -> Iterator[Fin
             }
         )
         other = Session.open(run_session(recording, plan, scratch, report=False, progress=progress))
-        tables = [path for path in sorted(session.path.iterdir()) if path.suffix in _TABLES]
+        tables = [
+            path for path in sorted(session.path.iterdir()) if path.suffix in (".parquet", ".csv")
+        ]
         differing = [path.name for path in tables if not _same_rows(path, other.path / path.name)]
         then, now = session.metadata.get("versions", {}), other.metadata["versions"]
     if not differing:

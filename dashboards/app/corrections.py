@@ -39,7 +39,6 @@ Report = Callable[[Path], object]
 
 SAVED = "saved"
 FAILED = "failed"
-_CALM_S = 3.0  # time without a correction before the report is made again
 
 
 @dataclass
@@ -79,9 +78,8 @@ class Saver:
         calm_s: time without corrections before a session's report is made again, s.
     """
 
-    def __init__(
-        self, correct: Correct, report: Report | None = None, calm_s: float = _CALM_S
-    ) -> None:
+    # time without a correction before the report is made again
+    def __init__(self, correct: Correct, report: Report | None = None, calm_s: float = 3.0) -> None:
         self._correct = correct
         self._report = report
         self._calm_s = calm_s

@@ -60,7 +60,6 @@ from .tables import number, records, session_address
 
 ShowReplay = Callable[[Path, float], object]
 Span = tuple[float, float]
-_ASSETS = Path(__file__).parent / "assets"
 _STEPS = (
     ("frame", -1, "◀ frame"),
     ("frame", 1, "frame ▶"),
@@ -80,7 +79,6 @@ _FACTS = (
     ("gap_before", "frames missing before", ""),
     ("zone", "zone", ""),
 )
-_MOVED = (("heading_rad", "heading", "rad"), ("length_mm", "length", "mm"))
 
 
 class Pages:
@@ -176,7 +174,9 @@ class Pages:
             steps=_STEPS,
             may_show=self._show_replay is not None,
             sentences=correcting.SENTENCES if self._may_correct else (),
-            modules=sorted(path.name for path in _ASSETS.glob("desk*.mjs")),
+            modules=sorted(
+                path.name for path in (Path(__file__).parent / "assets").glob("desk*.mjs")
+            ),
         )
 
     def whole(self, key: str) -> Response:
@@ -496,7 +496,10 @@ def facts(session: Session, at_s: float) -> list[tuple[str, str]]:
         measured = [(one.column, one.title.lower(), one.unit) for one in curves]
         found += [
             (title, *shown(moved[name], unit))
-            for name, title, unit in (*measured, *_MOVED)
+            for name, title, unit in (
+                *measured,
+                *(("heading_rad", "heading", "rad"), ("length_mm", "length", "mm")),
+            )
             if name in moved
         ]
     bouts = session.bouts

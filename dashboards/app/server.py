@@ -159,16 +159,12 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MOST_BYTES = 4 << 20  # of a request's body; a correction has a few hundred bytes
 _SAVER = "liex_saver"
 _IDLE_S = 30  # browsers open connections before they need them; an idle one is closed
-# addresses to listen on that a browser cannot open
-_EVERYWHERE = ("", "0.0.0.0", "::")  # nosec B104: only compared with
 _COOKIE = "liex_dashboard"
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: "
     "blob:; connect-src 'self'; font-src 'self' data:; base-uri 'none'; form-action 'self'; "
     "frame-ancestors 'none'"
 )
-# a report needs no script
-_REPORT = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 def make_app(
@@ -352,7 +348,8 @@ def address(host: str, port: int, token: str) -> str:
         token: required of every visitor; may be empty.
     """
     shown = "127.0.0.1" if host in LOOPBACK else host
-    if host in _EVERYWHERE:
+    # addresses to listen on that a browser cannot open
+    if host in ("", "0.0.0.0", "::"):  # nosec B104: only compared with
         shown = socket.gethostname()
     return f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/" + (
         f"?token={token}" if token else ""
@@ -470,7 +467,10 @@ class Downloads:
         except (LiexError, OSError, ValueError):
             return Response("This session has no report.", 404, mimetype="text/plain")
         answer = Response(page, mimetype="text/html")
-        answer.headers["Content-Security-Policy"] = _REPORT
+        # a report needs no script
+        answer.headers["Content-Security-Policy"] = (
+            "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+        )
         return answer
 
 

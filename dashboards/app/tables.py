@@ -103,7 +103,6 @@ FLIPS = {
     "applied": "corrected",
     "source": "by",
 }
-BOUT_UNITS = {"peak_speed_mm_s": "mm/s"}
 STATES = {
     "done": "done",
     "changed": "changed since",
@@ -141,7 +140,7 @@ def find(data: StudyData, name: str) -> Table:
             rows,
             {column: title for column, title in _OF_SESSION[what].items() if column in rows},
             "start_s",
-            BOUT_UNITS,
+            {"peak_speed_mm_s": "mm/s"},
         )
     raise SessionError(f"there is no table '{name}'")
 

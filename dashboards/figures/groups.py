@@ -47,10 +47,9 @@ from .style import (
 from .times import walked
 
 NO_GROUP = "no group"
-Grouped = dict[str, dict[str, list[SessionAnimal]]]  # group -> subject -> its sessions
 
 
-def by_group(animals: Sequence[SessionAnimal]) -> Grouped:
+def by_group(animals: Sequence[SessionAnimal]) -> dict[str, dict[str, list[SessionAnimal]]]:
     """The sessions of each subject of each group, groups in the given order, subjects by name.
 
     Args:

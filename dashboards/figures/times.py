@@ -295,7 +295,6 @@ def _clock(axes: Axes, span_s: Span, last: bool = True) -> None:
 # By action
 
 CERTAIN = 0.05  # level of the corrected p
-_MORE = BLUE
 _BESIDE = 4  # panels per row
 
 
@@ -424,7 +423,7 @@ def _against_chance(found: dict[str, Array], i: int, j: int) -> str:
     if not found["p_fdr"][i, j] <= CERTAIN:
         return MUTED
     # less often
-    return _MORE if found["probability"][i, j] > found["by_chance"][i, j] else "#d55e00"
+    return BLUE if found["probability"][i, j] > found["by_chance"][i, j] else "#d55e00"
 
 
 def _matrix(axes: Axes, words: list[str], found: dict[str, Array]) -> None:

@@ -13,13 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from liex_lab.evaluation.scores import Followed, MeasuredIndividual
+from liex_lab.evaluation.scores import Array, Followed, MeasuredIndividual
 from liex_lab.recordings.formats.images.nyu import POINTS
 from liex_lab.simulation.recording import TrueAnimal, TrueRecording
 from liex_lab.simulation.simulator import TestSequence
 
-Array = NDArray[np.float64]
-Edges = Sequence[tuple[int, int]]
 Results = Sequence[Mapping[str, Any]]
 
 METHODS = {  # variant: (name in the legend, colour, line)
@@ -112,7 +110,12 @@ def _save(figure: Figure, path: Path) -> Path:
 
 
 def _bones(
-    panel: Axes, points: Array, edges: Edges, colour: str, width: float, dot: int | None = 0
+    panel: Axes,
+    points: Array,
+    edges: Sequence[tuple[int, int]],
+    colour: str,
+    width: float,
+    dot: int | None = 0,
 ) -> None:
     """A skeleton of points (J, 2), with a dot on one joint."""
     panel.plot(

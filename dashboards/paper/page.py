@@ -55,7 +55,6 @@ _ANIMAL = {
     "Fig. 13": "fish",
     "Fig. 14": "mouse",
 }
-_PART = {"Fig. 18": "tracking", "Fig. 19": "actions", "Fig. 20": "actions"}
 
 
 def write_paper(
@@ -379,7 +378,13 @@ def exhibits(
 
 def _why_missing(label: str, results: Sequence[Results], further: Mapping[str, Any]) -> str:
     """Why a label is empty; '' for the paper's drawings."""
-    if (part := _PART.get(label, "nyu" if label == "Fig. 12" else "")) in further["missing"]:
+    part = {
+        "Fig. 12": "nyu",
+        "Fig. 18": "tracking",
+        "Fig. 19": "actions",
+        "Fig. 20": "actions",
+    }.get(label, "")
+    if part in further["missing"]:
         return f"Not made: {further['missing'][part]}."
     if label == "Fig. 7":
         why = [

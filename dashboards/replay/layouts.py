@@ -152,7 +152,6 @@ def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, A
 
 
 LAYOUT_FILE = "foxglove.json"
-_EMPTY_LAYOUT = Path(__file__).parent / LAYOUT_FILE  # scene and depth above, the rest below
 
 
 def write_layout(session: Session) -> Path:
@@ -168,7 +167,10 @@ def foxglove_layout(about: dict[str, Any]) -> dict[str, Any]:
     Args:
         about: the content of session.json.
     """
-    layout: dict[str, Any] = json.loads(_EMPTY_LAYOUT.read_text(encoding="utf-8"))
+    # scene and depth above, the rest below
+    layout: dict[str, Any] = json.loads(
+        (Path(__file__).parent / LAYOUT_FILE).read_text(encoding="utf-8")
+    )
     panels = layout["configById"]
     far_mm = float(about["camera"]["floor_distance_mm"])
     panels["Image!depth"]["imageMode"] |= {

@@ -93,7 +93,6 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[NDArray[np.uint8], 
         container.mux(stream.encode())
 
 
-_MOST = 12  # clips of a group
 _WHOLE_PX = 640
 _CELL_PX = 240
 _HEAD_PX = 26
@@ -191,7 +190,7 @@ def write_clips(
     path: Path,
     actions: Sequence[str] = (),
     *,
-    most: int = _MOST,
+    most: int = 12,
     slower: float = 1.0,
     progress: Progress = silent,
 ) -> Path:

@@ -29,7 +29,13 @@ from sklearn.metrics import f1_score
 from sklearn.tree import DecisionTreeClassifier
 
 from liex_lab.actions import channels, ethogram, storage, vocabulary
-from liex_lab.actions.labels import LabelledTrack, confusion, interval95, timeline_scores
+from liex_lab.actions.labels import (
+    Array,
+    LabelledTrack,
+    confusion,
+    interval95,
+    timeline_scores,
+)
 from liex_lab.actions.learning import DESCRIPTORS, SequenceForest, describe
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.behaviour.bouts import measure_bouts, recognise
@@ -51,8 +57,6 @@ from ..training.action_model import (
     training_recordings,
 )
 from ..training.pose_model import cache_folder, estimator_of
-
-Array = NDArray[np.float64]
 
 _SEEDS = 5
 _SLOWER_HZ = (15.0, 30.0)

@@ -24,15 +24,13 @@ from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
-from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation.recording import FRAME_NS, SyntheticSession
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.species import MouseSpecies
-
-Array = NDArray[np.float64]
 
 POINTS = ("tail base", "hind back", "fore back", "neck", "nose")
 POSTURE = ("trunk_bend", "trunk_arch", "pitch", "head_turn", "head_pitch", "stretch")
@@ -192,7 +190,6 @@ def nearest(real: PointMotion, virtual: PointMotion) -> Array:
     )
 
 
-NAMES = ("TTI", "Trunk", "Spine", "Neck", "Nose")
 UPS = {
     sign + axis: (k, -1.0 if sign else 1.0) for k, axis in enumerate("xyz") for sign in ("", "-")
 }
@@ -208,7 +205,7 @@ Bodies = tuple[Pose, Array, BodyShape]  # poses (n), girth (n,), shapes (n)
 def evaluate_motion(
     reference: str | Path,
     *,
-    names: Sequence[str] = NAMES,
+    names: Sequence[str] = ("TTI", "Trunk", "Spine", "Neck", "Nose"),
     up: str = "z",
     rate_hz: float | None = None,
     progress: Progress = silent,

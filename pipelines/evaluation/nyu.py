@@ -23,6 +23,7 @@ from liex_lab.recordings.formats.images.nyu import (
     N_FIRST_PERSON,
     PALM,
     POINTS,
+    Array,
     NyuReference,
     frame_numbers,
     points_of_joints,
@@ -32,7 +33,6 @@ from liex_lab.simulation.hand.simulator import OBSERVED_SHARE
 
 from ..build import build_estimator, build_recording, build_scene
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 NYU_PROTOCOL = (

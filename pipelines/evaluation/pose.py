@@ -21,7 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.baselines.baseline import Baseline, Guesses, PlainMean
-from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.errors import EstimationError, LiexError, PlanError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import METHODS
@@ -45,7 +45,6 @@ from ..build import build_scene, plan_of
 from ..training.motion_model import observed
 from ..training.pose_model import BASELINES, estimator_of, trained_baseline
 
-Array = NDArray[np.float64]
 Subject = PoseEstimator | Baseline
 
 OTHER_BUILD: Final = "other-build"

@@ -48,7 +48,6 @@ from . import speed
 from .speed import FPS, STEP_NS, as_mcap, evaluate_kinds, isolated, looped, to_and_fro
 
 _VIRTUAL = "synthetic:walk?seed={seed}&frames={n}&sensor={sensor}"
-_WORKERS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000)
 _CREWS = {  # name -> number of processes, and of cores for all of them
     "1": (1, 1),
     "2": (2, 2),
@@ -311,7 +310,10 @@ def _workers(walks: list[Path], folder: Path) -> tuple[dict[str, Any], list[floa
 
 
 def simulate(
-    session_s: list[float], scheduler_s: float, workers: tuple[int, ...] = _WORKERS, seed: int = 0
+    session_s: list[float],
+    scheduler_s: float,
+    workers: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1000),
+    seed: int = 0,
 ) -> dict[str, float]:
     """Sessions per hour by number of workers, a discrete-event simulation of 2,000 sessions.
 

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 from liex_lab.dashboards.paper.figures import draw_scene
-from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, MisfitError
 from liex_lab.evaluation.scores import SCENES_PROTOCOL, MeasuredIndividual, Tally
@@ -29,8 +28,6 @@ from ..arenas import run_arenas
 from ..build import plan_of, propose_arenas
 from ..session import run_session
 
-Array = NDArray[np.float64]
-
 # alternately another build and one of those that models were trained on
 SEEDS: Final = tuple(range(1001, 1013))
 # not 931_507_211 to 213, whose results have influenced development
@@ -40,8 +37,6 @@ SEALED_SEEDS: Final = (958_204_331, 958_204_332, 958_204_333)
 Case = tuple[
     str, str, str
 ]  # scene, bundled plan, and the row its error is divided by ('' for none)
-# individuals of all sessions that were written, problems or the sentence of a refusal, exit code
-Outcome = tuple[list[MeasuredIndividual], list[str], int]
 
 
 def cases() -> dict[str, Case]:
@@ -134,7 +129,9 @@ def _measure_row(
     return {**tally.figures(), "said": said, "exit_code": exit_code}
 
 
-def run_product(recording: TrueRecording, plan: Plan) -> Outcome:
+def run_product(
+    recording: TrueRecording, plan: Plan
+) -> tuple[list[MeasuredIndividual], list[str], int]:
     """Measure a recording as a user does, and read the tables back.
 
     Returns:

@@ -87,13 +87,6 @@ LIVE_PROTOCOL = (
 _SEED = 78_001
 FPS = 30
 STEP_NS = int(1e9 / FPS)
-# frames tracked beforehand, and their speed-up
-_WARM = 60
-_OF_EACH = ("latency_median_ms", "latency_p95_ms", "n_frames", "n_live", "n_measured")
-_ONE_THREAD = (
-    *("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
-    "OPENCV_FOR_THREADS_NUM",
-)
 _CHILD = """
 import json, sys, time
 from importlib import import_module
@@ -135,7 +128,15 @@ def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str
         LiexError: the process failed.
     """
     words = [json.dumps(one if isinstance(one, int | float) else str(one)) for one in arguments]
-    environment = os.environ | dict.fromkeys(_ONE_THREAD if one_thread else (), "1")
+    environment = os.environ | dict.fromkeys(
+        (
+            *("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS"),
+            "OPENCV_FOR_THREADS_NUM",
+        )
+        if one_thread
+        else (),
+        "1",
+    )
     began = time.perf_counter()
     ran = subprocess.run(
         own_python("-c", _CHILD, job, *words),
@@ -373,7 +374,10 @@ def evaluate_live(
                 partial(film, ready=manager.Barrier(n_cameras)), range(_SEED, _SEED + n_cameras)
             )
         )
-    numbers = {name: [one[name] for one in cameras] for name in _OF_EACH}
+    numbers = {
+        name: [one[name] for one in cameras]
+        for name in ("latency_median_ms", "latency_p95_ms", "n_frames", "n_live", "n_measured")
+    }
     latest = {
         name: max((one for one in numbers[name] if one is not None), default=None)
         for name in ("latency_median_ms", "latency_p95_ms")
@@ -404,9 +408,8 @@ def _film(
         step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
         plan = plan_of(animal)
-        track_live(
-            replayed(arriving[: learn_frames + _WARM], 1000.0), plan, learn_frames=learn_frames
-        )
+        # 60 frames tracked beforehand, a thousand times as fast
+        track_live(replayed(arriving[: learn_frames + 60], 1000.0), plan, learn_frames=learn_frames)
         if ready is not None:
             ready.wait()
     except BaseException:
@@ -442,7 +445,6 @@ def to_and_fro(n_short: int, n: int) -> NDArray[np.int64]:
 # Benchmarks of recording formats: reading speed, and the cost of a whole run.
 
 
-_HOUR = 3600 * FPS  # frames
 _SMALL = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 _VIRTUAL = "synthetic:walk?seed=5&frames={frames}&sensor={sensor}"
 _READING_PROTOCOL = (
@@ -506,7 +508,11 @@ FORMATS: dict[str, tuple[str, Callable[[Path, Camera, Iterable[DepthFrame]], Non
 
 
 def evaluate_recordings(
-    *, n_frames: int = 150, n_hour: int = _HOUR, n_repeats: int = 5, progress: Progress = silent
+    *,
+    n_frames: int = 150,
+    n_hour: int = 3600 * FPS,
+    n_repeats: int = 5,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Decoding speed and peak memory of every written format, as the protocol states.
 

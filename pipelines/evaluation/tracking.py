@@ -31,9 +31,8 @@ from typing import Any
 import numba
 import numpy as np
 from liex_lab.dashboards.paper.figures import draw_tracking
-from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.evaluation.scores import TRACKING_PROTOCOL, Followed, tracking_figures
 from liex_lab.plan import Plan
@@ -52,8 +51,6 @@ from liex_lab.tracking.trust import single_frames
 from ..build import build_scene, plan_of
 from ..training.pose_model import estimator_of
 
-Array = NDArray[np.float64]
-
 ROWS = {
     "single": "single frames",
     "algorithm3": "Algorithm 3 on our parts",
@@ -68,9 +65,7 @@ BASE_ROUNDS = {"algorithm3_paper": 0, "algorithm3_paper_base_round": 1}
 PAPER_ROWS = (SINGLE, *BASE_ROUNDS)
 ONLINE_LAG = 5  # frames
 _CHUNK = 32
-# chunks that the tracker is timed on, and repeats
-_TIMED = 3
-_AGAIN = 3
+_AGAIN = 3  # repeats of a timing
 # the search: parameters, factors, and the limit of passes
 _SEARCHED = ("turn_rad", "shift_mm", "sigma_mm")
 _FACTORS = (0.5, 2.0)
@@ -217,7 +212,8 @@ def _speed(tracker: FrameTracker, recording: simulator.TestSequence) -> dict[str
     From depth images in memory to the smoothed track: the best of alternating repeats over the
     sequence's first frames.
     """
-    chunks = [frames for frames, _ in zip(recording.chunks(_CHUNK), range(_TIMED), strict=False)]
+    # of the first three chunks
+    chunks = [frames for frames, _ in zip(recording.chunks(_CHUNK), range(3), strict=False)]
     best = {"frames_per_s_1core": 0.0, "frames_per_s_all_cores": 0.0}
     for _ in range(_AGAIN):
         for name, parallel in zip(best, (False, True), strict=True):

@@ -28,7 +28,6 @@ from liex_lab.recordings.open import stated_subject
 from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.progress import Progress, silent
 
-_FILES = (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".mkv", ".avi")
 _DEPTHS = ("depth.dat", "depth.avi", "depth.mkv")  # each marks its folder as a recording
 _COMPARED_BYTES = 1 << 20  # compared at the beginning and the end of files of the same size
 _MOST_LISTED = 4  # sessions of an animal
@@ -171,7 +170,13 @@ def find_recordings(folder: Path) -> list[Path]:
     found = []
     for inside, folders, names in os.walk(folder):
         here = Path(inside)
-        files = [name for name in sorted(names) if name.lower().endswith(_FILES)]
+        files = [
+            name
+            for name in sorted(names)
+            if name.lower().endswith(
+                (".mcap", ".bag", ".db3", ".oni", ".tar.gz", ".tgz", ".mkv", ".avi")
+            )
+        ]
         # these, too, if the folder has no files of depth
         noted = not set(names).isdisjoint(("camera.toml", "raytrix.toml")) and not files
         one_recording = here != folder and (noted or not set(names).isdisjoint(_DEPTHS))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from liex_lab.actions import learning, storage, vocabulary
 from liex_lab.actions.ethogram import UNLABELLED
 from liex_lab.actions.labels import LabelledTrack, read_labels, sessions_named, words_of
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import Array, Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
@@ -51,8 +51,6 @@ from liex_lab.tracking.track import Subject
 from liex_lab.tracking.tracker import PatchObserver
 
 from .pose_model import cache_folder, estimator_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -566,12 +564,9 @@ def suggest(
 WORDS = {"fish": fish_acts.ACTIONS, "mouse": mouse_acts.ACTIONS}
 RATE_HZ = {"fish": 50.0, "mouse": 30.0}  # of their cameras
 FAST_HZ = 100.0
-# cut-out sequences, as in the paper, of 5 and 2 fish
-N_TRAIN = 426
 _TRAIN_SET = tuple(range(201, 225))
 _TEST_SET = tuple(range(301, 307))
 N_USUAL = len(_TRAIN_SET)  # the first training recordings are of the usual camera
-_FAST_SET = {"fish": tuple(range(225, 233))}
 
 
 def cut_sequences(animal: str, test: bool) -> list[Scenario]:
@@ -579,7 +574,8 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 
     426 training sequences of five individuals, or 173 test sequences of two.
     """
-    individuals, n = ((106, 107), 173) if test else ((101, 102, 103, 104, 105), N_TRAIN)
+    # as in the paper, of 5 and 2 fish
+    individuals, n = ((106, 107), 173) if test else ((101, 102, 103, 104, 105), 426)
     words = WORDS[animal]
     return [
         Scenario(
@@ -596,7 +592,10 @@ def cut_sequences(animal: str, test: bool) -> list[Scenario]:
 def training_recordings(animal: str) -> list[Scenario]:
     """Uncut training recordings, 24 of 40 s each; for fish also 8 of 20 s each at 100 Hz."""
     usual = [Scenario(animal, one, 1, RATE_HZ[animal], 40.0) for one in _TRAIN_SET]
-    return usual + [Scenario(animal, one, 2, FAST_HZ, 20.0) for one in _FAST_SET.get(animal, ())]
+    return usual + [
+        Scenario(animal, one, 2, FAST_HZ, 20.0)
+        for one in (range(225, 233) if animal == "fish" else ())
+    ]
 
 
 def test_recordings(animal: str, fast: bool, minutes: float) -> list[Scenario]:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.pose import Pose
-from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.geometry import SE3, so3
 from liex_lab.plan import Plan
@@ -43,15 +43,10 @@ from liex_lab.tracking.trust import stretch_of
 from ..build import build_scene, plan_of
 from .pose_model import estimator_of
 
-Array = NDArray[np.float64]
 Knots = tuple[tuple[float, float], ...]
 
-SEEDS = dict.fromkeys(("easy", "hard"), tuple(range(101, 109)))
 BUILD_SEEDS = tuple(range(201, 230))  # of animals of other builds
 _Z90 = 1.645
-# grids of the stretch's coefficients, see `MotionParameters.stretch`
-_PER_BLUR = np.arange(0.0, 6.5, 0.5)
-_PER_SPREAD = np.arange(0.0, 3.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -94,7 +89,7 @@ def train_tracking(
         animal: a bundled animal's name, or the path of a skeleton's TOML.
         out: path of the file to write; the other animals' tables are copied unchanged.
         n_frames: frames of each sequence; None means its usual length.
-        seeds: of the sequences, instead of `SEEDS`.
+        seeds: of the sequences, instead of the usual ones.
         workers: threads of the kernels; 0 means all.
         progress: called with the progress of the job.
 
@@ -105,8 +100,8 @@ def train_tracking(
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     measured = [
         measure(animal, kind, seed, n_frames, progress)
-        for kind, usual in SEEDS.items()
-        for seed in seeds or usual
+        for kind in ("easy", "hard")
+        for seed in seeds or range(101, 109)
     ]
     tuning = calibrate_joints(measured, TrackingParameters.of(animal))
     tuning = calibrate_roots(measured, tuning)
@@ -271,7 +266,8 @@ def calibrate_joints(
     claims = [_claim(each, plain) for each in measured]
     best = (0.0, 0.0)
     least = np.inf
-    for stretch in product(_PER_BLUR.tolist(), _PER_SPREAD.tolist()):
+    # grids of the stretch's coefficients, see `MotionParameters.stretch`
+    for stretch in product(np.arange(0.0, 6.5, 0.5).tolist(), np.arange(0.0, 3.5, 0.5).tolist()):
         knots = calibration_knots(claims, stretch)
         apart = float(
             np.mean([np.log(_nine_in_ten(claim.over(knots, stretch))) ** 2 for claim in claims])

@@ -26,13 +26,12 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.baselines import baseline
 from liex_lab.baselines.baseline import Baseline
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
-from liex_lab.body.skeleton import FOREGROUNDS, Skeleton
+from liex_lab.body.skeleton import FOREGROUNDS, Array, Skeleton
 from liex_lab.catalog import bundled_models, find_model
 from liex_lab.estimation.cascade import ImageSet, TrainingSet, Truth
 from liex_lab.estimation.estimator import PoseEstimator
@@ -58,8 +57,6 @@ from liex_lab.scene.height_maps import HeightMaps, Patches, moment_columns, view
 from liex_lab.sessions.provenance import package_version
 from liex_lab.simulation import simulator, training_patches
 from liex_lab.simulation.species import GenericSpecies
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -96,14 +93,6 @@ class Recipe:
 
 # images of the last training by their inputs, see `shared_images`; None keeps none
 _shared: ContextVar[list[tuple[Any, TrainingSet]] | None] = ContextVar("_shared", default=None)
-# separate random streams, so that each step can be repeated by itself
-_CALIBRATION = 1
-# share of the images for calibrating an animal's predicted error that show bodies that vary as
-# individuals do; with the others alone, which vary far more, intervals would be wider than most
-# animals need
-_ORDINARY_SHARE = {"mouse": 0.5}
-# of home-sized animals from above, if it differs from the home pose's
-_AREAS_MM2 = {"mouse": 1070.0}
 
 # the paper's variant and the baselines learn from the same images, noise and sizes: of animals near
 # home size, with as much noise as the default's
@@ -111,11 +100,14 @@ RECIPES = {
     "default": Recipe(),
     "paper": Recipe(n_images=40_960, n_correction=0, n_calibration=4_096, sizes=((0.0, 144),)),
 }
-_FISH_SIZES = ((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328))
 # recipes by animal and variant that differ from the mouse's
 _OWN: dict[tuple[str, str], Recipe] = {
     ("fish", "default"): Recipe(
-        seed=31, n_images=16_384, n_correction=4_096, n_calibration=4_096, sizes=_FISH_SIZES
+        seed=31,
+        n_images=16_384,
+        n_correction=4_096,
+        n_calibration=4_096,
+        sizes=((0.0, 272), (21.0, 192), (0.0, 272), (36.0, 328)),
     ),
     ("fish", "paper"): Recipe(
         seed=31, n_images=16_384, n_correction=0, n_calibration=2_048, sizes=((0.0, 272),)
@@ -265,7 +257,8 @@ def make_model(
         progress(steps - 1, steps, "calibrating the predicted error")
         first = recipe.n_images + recipe.n_correction
         unseen = calibration_set(skeleton, method, recipe, first)
-        model = calibrate(model, unseen, np.random.default_rng([recipe.seed, _CALIBRATION]))
+        # separate random streams, so that each step can be repeated by itself
+        model = calibrate(model, unseen, np.random.default_rng([recipe.seed, 1]))
     if method.tells_facing:
         progress(steps - 1, steps, "learning to tell head from tail")
         first = recipe.n_images + recipe.n_correction + recipe.n_calibration
@@ -356,7 +349,10 @@ def calibration_set(skeleton: Skeleton, method: Method, recipe: Recipe, first: i
     Returns:
         The images, varied bodies first.
     """
-    ordinary = round(_ORDINARY_SHARE.get(skeleton.name, 0.0) * recipe.n_calibration)
+    # share of the images for calibrating an animal's predicted error that show bodies that vary as
+    # individuals do; with the others alone, which vary far more, intervals would be wider than most
+    # animals need
+    ordinary = round({"mouse": 0.5}.get(skeleton.name, 0.0) * recipe.n_calibration)
     varied = rendered_set(skeleton, method, recipe, first, recipe.n_calibration - ordinary, silent)
     if not ordinary:
         return varied
@@ -427,7 +423,8 @@ def extract(
     )
     cut = Patches(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
     # of an animal from above, about; only ranks the blobs of a window
-    home_mm2 = _AREAS_MM2.get(skeleton.name) or Surface.of(skeleton).area_mm2
+    # of home-sized animals from above, if it differs from the home pose's
+    home_mm2 = {"mouse": 1070.0}.get(skeleton.name) or Surface.of(skeleton).area_mm2
     area_mm2 = home_mm2 * (windows.spine_mm / skeleton.length) ** 2
     # a scene learned from a recording has an estimate of its readings' spread
     least_mm = np.maximum(skeleton.view.min_height_mm, SPREADS * windows.spread_mm)

@@ -14,9 +14,8 @@ from pathlib import Path
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from liex_lab.body.pose import Pose
+from liex_lab.body.pose import Array, Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
@@ -29,11 +28,7 @@ from liex_lab.simulation import simulator, training_patches
 
 from .pose_model import estimator_of, extract, recipe_of
 
-Array = NDArray[np.float64]
-
-N_SESSIONS = 512
 PER_SESSION = 16
-SEEDS = {"wide": 41, "other": 42}  # of a family's images
 _LEAST_GOOD = 8  # frames per mini-session
 
 
@@ -67,7 +62,7 @@ def train_shape(
     if workers:
         numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
     estimator = estimator_of(animal, "default", progress)
-    known = n_sessions or N_SESSIONS
+    known = n_sessions or 512
     rows = list(mini_sessions(estimator, "wide", known, progress))
     prior = ShapePrior.fit(*(np.stack(part) for part in zip(*rows, strict=True)))
     others = list(mini_sessions(estimator, "other", known // 4, progress))
@@ -112,7 +107,8 @@ def mini_sessions(
             f"'{skeleton.name}'"
         )
     recipe = recipe_of("default", skeleton)
-    seed = SEEDS[family]
+    # of a family's images
+    seed = {"wide": 41, "other": 42}[family]
     n_blocks = -(-n * PER_SESSION // training_patches.BLOCK)
     for number in range(n_blocks):
         progress(number, n_blocks, f"rendering animals of the family '{family}'")

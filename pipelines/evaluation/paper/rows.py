@@ -23,7 +23,7 @@ from liex_lab.baselines.baseline import (
     chosen,
     second_is_likelier,
 )
-from liex_lab.body.skeleton import Skeleton
+from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.errors import PlanError
 from liex_lab.estimation.cascade import N_DIRECTIONS, Candidates, Cascade, TrainingSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
@@ -50,7 +50,6 @@ from ...training.pose_model import estimator_of, recipe_of, rendered_set
 from ..pose import Subject, subject_of, unpacked
 from ..speed import SpeedSample, two_cores
 
-Array = NDArray[np.float64]
 Tests = Mapping[str, Sequence[TrueRecording]]  # by split
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
@@ -394,9 +393,6 @@ PROTOCOL = (
     "the worst."
 )
 INITIAL_POSES = "initial poses"
-_PROPOSED = (
-    "not varied: a forest proposes the initial poses of this variant, two for each of its trees"
-)
 
 
 @dataclass(frozen=True)
@@ -464,7 +460,14 @@ def sensitivity(
     recipe = _near_home_size(skeleton)
     data = rendered_set(skeleton, method, recipe, 0, sweep.n_images, silent)
     test = rendered_set(skeleton, method, recipe, sweep.n_images, sweep.n_test, silent)
-    left_out = {} if method.proposals is None else {INITIAL_POSES: _PROPOSED}
+    left_out = (
+        {}
+        if method.proposals is None
+        else {
+            INITIAL_POSES: "not varied: a forest proposes the initial poses of this variant, two "
+            "for each of its trees"
+        }
+    )
     own = {name: n for name, n in chosen_values(method).items() if name not in left_out}
     points = [
         (number, value)

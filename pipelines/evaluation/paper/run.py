@@ -55,8 +55,6 @@ from .rows import ROWS, SWEPT, TRAINING_DRAWS, Subject, Sweep, Tests
 CURVES = "fig7"  # name of the curves among the names of rows
 PARTS = ("tracking", "actions")
 SCHEMA = 4
-_DIGITS = 6  # significant digits of a kept number
-_DEEP = re.compile(r"\n {5,}|\n {4}(?=[]}])")  # line breaks within a list or the numbers of a split
 _N_SESSIONS = 40
 _VERBS = {
     "tracking": "liex evaluate tracking --animal mouse --sequence easy --figure F.png",
@@ -64,7 +62,6 @@ _VERBS = {
     "nyu": "liex evaluate nyu --reference FOLDER",
 }
 # a quick run
-_QUICK_FRAMES = 100
 _QUICK_ILLUSTRATED = 16
 _QUICK_IMAGES = {"paper": 1_024, "rf": 2_048, "cnn": 2_048}
 QUICK_SWEEP = Sweep(
@@ -114,7 +111,7 @@ class Budget:
             raise PlanError(f"there is no row '{unknown[0]}'; known are {', '.join(known)}")
         wanted = tuple(row for row in ROWS if not rows or row in rows or row == "default")
         if quick:
-            return Budget(n_frames or _QUICK_FRAMES, wanted, True, False, True, sealed)
+            return Budget(n_frames or 100, wanted, True, False, True, sealed)
         whole = n_frames is None and not sealed
         everything = fresh and not rows
         return Budget(
@@ -247,8 +244,14 @@ def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
         "rows": {name: _rounded(row) for name, row in kept.items() if name != "default"},
         "sensitivity": curves,
     }
+    # line breaks within a list or the numbers of a split
     path.write_text(
-        _DEEP.sub("", json.dumps(content, indent=1, sort_keys=True, allow_nan=False)) + "\n",
+        re.sub(
+            r"\n {5,}|\n {4}(?=[]}])",
+            "",
+            json.dumps(content, indent=1, sort_keys=True, allow_nan=False),
+        )
+        + "\n",
         encoding="utf-8",
     )
     return path
@@ -264,7 +267,8 @@ def _rounded(value: Any) -> Any:
         return {key: _rounded(one) for key, one in value.items()}
     if isinstance(value, list):
         return [_rounded(one) for one in value]
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+    # significant digits of a kept number
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def processor() -> str:
