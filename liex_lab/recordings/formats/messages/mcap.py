@@ -1,26 +1,22 @@
 """MCAP recordings, whole, cut or still growing: depth in Foxglove's or ROS's messages.
 
 Records (opcode, u64 length, content) are walked in file order; messages are in chunks (none, zstd,
-lz4), which threads unpack ahead if the summary at the file's end lists their positions. Schemas and
-channels are also read from the summary, in case the first ones are damaged.
+lz4). Schemas and channels are also read from the summary at the file's end, in case the first ones
+are damaged.
 
 Callers that refuse damage (`open_recording(..., strict=True)`) open a file by its index instead,
 without unpacking its chunks, if the index lists every message that the file's statistics count.
-Only the beginning of each depth message, with the sensor's stamp, is unpacked, on several threads;
-a chunk is checked against its CRC-32 when a frame in it is read. Any other file is walked.
+Only the beginning of each depth message, with the sensor's stamp, is unpacked; a chunk is checked
+against its CRC-32 when a frame in it is read. Any other file is walked.
 
 `open_replay` opens session.mcap, which liex_lab wrote with the times of its frames: no stamp is
 read, because single frames of a long recording are needed quickly.
 """
 
-import itertools
 import struct
 import zlib
-from bisect import bisect_right
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from collections.abc import Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import IO
@@ -30,7 +26,6 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
@@ -61,8 +56,6 @@ _FOOTER = struct.Struct(
 _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
-# chunks of at most this size are unpacked ahead
-THREADS = 2
 FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
 LARGEST_FACT = 1 << 24  # bytes of one such record
 DAMAGE = (
@@ -151,8 +144,6 @@ class McapFile(MessageFile):
         self.indexes: list[records.ChunkIndex] = []
         self.n_notes = 0  # records of metadata
         self._counted = (-1, -1)  # messages and metadata, by the file's own statistics
-        # chunks being unpacked, by the position of their content
-        self._coming: dict[int, Future[bytes]] = {}
         self._sure = (
             len(MAGIC),
             0,
@@ -186,16 +177,6 @@ class McapFile(MessageFile):
             The messages.
         """
         self._learn_ending()
-        with ThreadPoolExecutor(THREADS) as unpackers:
-            try:
-                yield from self._walk(wanted, progress, unpackers)
-            finally:
-                unpackers.shutdown(wait=False, cancel_futures=True)
-                self._coming.clear()
-
-    def _walk(
-        self, wanted: IsRelevant, progress: Progress, unpackers: ThreadPoolExecutor
-    ) -> Iterator[Envelope]:
         at = self._sure[0]
         footer = False
         while at + RECORD.size <= self.size and not footer:
@@ -204,7 +185,6 @@ class McapFile(MessageFile):
             if (end > self.size and (opcode != Opcode.CHUNK or self.starts)) or opcode == 0:
                 end = self.resume(at)  # an invalid size, or zeros: no record has the opcode 0
             elif opcode == Opcode.CHUNK:
-                self._look_ahead(at, unpackers)
                 yield from self._walk_chunk(start, end - start, wanted)
             elif opcode == Opcode.MESSAGE or (opcode in FACTS and end - start <= LARGEST_FACT):
                 data = memoryview(self.file.read(end - start))
@@ -219,25 +199,6 @@ class McapFile(MessageFile):
                 "looking through the recording (MB)",
             )
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
-
-    def _look_ahead(self, at: int, unpackers: ThreadPoolExecutor) -> None:
-        """Unpack the next chunks after `at` in the background, if the file's index lists them."""
-        n = bisect_right(self.starts, at)
-        for later in self.starts[n : n + THREADS]:
-            if later + RECORD.size + _CHUNK.size > self.size:
-                return
-            opcode, start, end = self._record(later)
-            if opcode != Opcode.CHUNK or start in self._coming:
-                continue
-            try:
-                chunk = self._chunk(start, end - start)
-            except (DamagedChunk, struct.error, UnicodeDecodeError):
-                return  # the walk reports it later
-            if chunk.size <= (1 << 23):
-                self.file.seek(chunk.offset)
-                self._coming[start] = unpackers.submit(
-                    unpacked, self.file.read(chunk.length), chunk
-                )
 
     def _record(self, at: int) -> tuple[int, int, int]:
         """Opcode of the record at `at`, and start and end of its content."""
@@ -285,8 +246,6 @@ class McapFile(MessageFile):
         number = len(self.chunks)
         try:
             self.chunks.append(self._chunk(start, length))
-            if start in self._coming:
-                self._last_chunk = (number, memoryview(self._coming.pop(start).result()))
             data = self.unpack(number)
         except (DamagedChunk, struct.error, UnicodeDecodeError):
             self.whole = False
@@ -369,7 +328,6 @@ _UNKNOWN = -1  # the length of a message is only stated in its chunk
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
 _ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
 _HEAD = 512  # first bytes of a message's record, with its stamp
-_BATCH = 32  # chunks per task of unpacking
 
 _Table = tuple[int, bytes]  # number of a chunk, and times and offsets of messages as written
 
@@ -474,65 +432,44 @@ class IndexedMcap(McapFile):
         read = stamp_reader(channel)
         if read is None:
             return None
-        by_chunk = np.flatnonzero(np.diff(listed.places[:, 0])) + 1
-        edges = [0, *by_chunk[_BATCH - 1 :: _BATCH].tolist(), len(listed.places)]
-        parts = (
-            IndexedMessages(channel, listed.log_time_ns[a:b], listed.places[a:b])
-            for a, b in itertools.pairwise(edges)
-        )
-        with ThreadPoolExecutor(THREADS) as unpackers:
-            found = list(unpackers.map(partial(self._stamps, read, channel_id), parts))
-        known = [one for one in found if one is not None]
-        if len(known) < len(found):
-            return None
-        table = np.concatenate(known)
-        good = table[:, 0] == 1
-        self.whole = self.whole and bool(good.all())
-        sent_ns = table[good, 2].view(np.uint64)
-        return IndexedMessages(
-            channel, listed.log_time_ns[good], listed.places[good], table[good, 1], sent_ns
-        )
-
-    def _stamps(
-        self,
-        read: Callable[[memoryview], int | None],
-        channel_id: int,
-        listed: IndexedMessages,
-    ) -> NDArray[np.int64] | None:
-        """(n, 3) for each message whether it could be read, its stamp and its time of sending, ns.
-
-        None if the beginnings of messages do not contain their stamps.
-        """
+        # for each message whether it could be read, its stamp and its time of sending, ns
         places = listed.places
         table = np.zeros((len(places), 3), np.int64)
-        with self.path.open("rb") as file:  # threads need separate file positions
-            for rows in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places[:, 0])) + 1):
-                if not len(rows):
-                    continue
-                try:
-                    chunk = self.believable(int(places[rows[0], 0]))
-                    offsets = places[rows, 1].tolist()
-                    file.seek(chunk.offset)
-                    packed = file.read(chunk.length)
-                    data = unpacked(packed, chunk, min(offsets[-1] + _HEAD, chunk.size))
-                    heads = [data[at : at + _HEAD] for at in offsets]
-                    for row, head in zip(rows.tolist(), heads, strict=True):
-                        opcode, length = RECORD.unpack_from(head)
-                        whose, _, log_ns, sent_ns = MESSAGE.unpack_from(head, RECORD.size)
-                        if (opcode, whose, log_ns) != (
-                            Opcode.MESSAGE,
-                            channel_id,
-                            listed.log_time_ns[row],
-                        ):
-                            raise DamagedChunk("there is another message than in its index")
-                        begin = RECORD.size + MESSAGE.size
-                        stamp_ns = read(memoryview(head)[begin : RECORD.size + length])
-                        if stamp_ns is None:
-                            return None
-                        table[row] = 1, stamp_ns, np.uint64(sent_ns).view(np.int64)
-                except (*DAMAGE, DamagedChunk):
-                    table[rows, 0] = 0
-        return table
+        for rows in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places[:, 0])) + 1):
+            if not len(rows):
+                continue
+            try:
+                chunk = self.believable(int(places[rows[0], 0]))
+                offsets = places[rows, 1].tolist()
+                self.file.seek(chunk.offset)
+                packed = self.file.read(chunk.length)
+                data = unpacked(packed, chunk, min(offsets[-1] + _HEAD, chunk.size))
+                heads = [data[at : at + _HEAD] for at in offsets]
+                for row, head in zip(rows.tolist(), heads, strict=True):
+                    opcode, length = RECORD.unpack_from(head)
+                    whose, _, log_ns, sent_ns = MESSAGE.unpack_from(head, RECORD.size)
+                    if (opcode, whose, log_ns) != (
+                        Opcode.MESSAGE,
+                        channel_id,
+                        listed.log_time_ns[row],
+                    ):
+                        raise DamagedChunk("there is another message than in its index")
+                    begin = RECORD.size + MESSAGE.size
+                    stamp_ns = read(memoryview(head)[begin : RECORD.size + length])
+                    if stamp_ns is None:
+                        return None
+                    table[row] = 1, stamp_ns, np.uint64(sent_ns).view(np.int64)
+            except (*DAMAGE, DamagedChunk):
+                table[rows, 0] = 0
+        good = table[:, 0] == 1
+        self.whole = self.whole and bool(good.all())
+        return IndexedMessages(
+            channel,
+            listed.log_time_ns[good],
+            listed.places[good],
+            table[good, 1],
+            table[good, 2].view(np.uint64),
+        )
 
     def read(self, place: MessagePlace) -> memoryview:
         """The data of one message; an unknown length is read from its chunk.
