@@ -16,12 +16,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from liex_lab.deprecated_paths import install_path_finder
-from liex_lab.runtime.kernel_cache import ignore_outdated_kernels, keep_kernels
+from liex_lab.runtime.kernel_cache import keep_kernels
 
 __version__ = "0.2.0"
 
 install_path_finder()
-ignore_outdated_kernels()
 # idle kernel threads sleep; OpenMP's default threads spin, on cores on which
 # recordings are read and logs are written (libgomp reads this when it is loaded)
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -5,15 +5,10 @@ either, as in a container or for a service account. Cached code is executed, so 
 TMPDIR is used only if this account owns it and nobody else can write to it.
 """
 
-import importlib.util
 import os
 import stat
 import sys
-from collections.abc import Sequence
-from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 VARIABLE = "NUMBA_CACHE_DIR"
 _ROOM = Path(__file__).resolve().parents[1] / "scene"  # one of the packages with kernels
@@ -44,53 +39,6 @@ def keep_kernels() -> str:
         f"compiled kernels are kept in {place}, as this account has no other place for them; name "
         f"a lasting one with {VARIABLE}"
     )
-
-
-def ignore_outdated_kernels() -> None:
-    """Make numba recompile kernels whose cache an earlier version wrote."""
-    if caching := sys.modules.get("numba.core.caching"):
-        _ignore_outdated(caching)
-    else:
-        sys.meta_path.insert(0, _CachingFinder())
-
-
-class _CachingFinder:
-    """Finds numba's module of caches, once, and applies `_ignore_outdated` when it is loaded."""
-
-    def find_spec(
-        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        """Spec of numba's module of caches, else None."""
-        if name != "numba.core.caching":
-            return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
-        if spec is not None and spec.loader is not None:
-            load = spec.loader.exec_module
-
-            def exec_module(module: ModuleType) -> None:
-                load(module)
-                _ignore_outdated(module)
-
-            spec.loader.exec_module = exec_module  # type: ignore[method-assign]
-        return spec
-
-
-def _ignore_outdated(caching: Any) -> None:
-    """Make numba treat an index that names record types of an earlier version as empty.
-
-    numba resolves all names in an index before it compares the index's age with the source, so a
-    renamed or moved record type would end every run until the cache is deleted by hand.
-    """
-    load = caching.IndexDataCacheFile._load_index
-
-    def load_index(self: Any) -> Any:
-        try:
-            return load(self)
-        except (AttributeError, ImportError):
-            return {}
-
-    caching.IndexDataCacheFile._load_index = load_index
 
 
 def _home_cache() -> Path:

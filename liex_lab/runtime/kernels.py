@@ -3,6 +3,7 @@
 from typing import Any
 
 from numba import njit
+from numba.core.caching import IndexDataCacheFile
 
 
 def kernel(**options: Any) -> Any:
@@ -30,3 +31,23 @@ def inner_kernel(**options: Any) -> Any:
         The decorator.
     """
     return kernel(no_cpython_wrapper=True, **options)
+
+
+def ignore_outdated_kernels() -> None:
+    """Make numba treat an index that names record types of an earlier version as empty.
+
+    numba resolves all names in an index before it compares the index's age with the source, so a
+    renamed or moved record type would end every run until the cache is deleted by hand.
+    """
+    load = IndexDataCacheFile._load_index
+
+    def load_index(self: Any) -> Any:
+        try:
+            return load(self)
+        except (AttributeError, ImportError):
+            return {}
+
+    IndexDataCacheFile._load_index = load_index
+
+
+ignore_outdated_kernels()

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from liex_lab.runtime import kernel_cache
-from liex_lab.runtime.kernel_cache import VARIABLE, ignore_outdated_kernels, keep_kernels
+from liex_lab.runtime.kernel_cache import VARIABLE, keep_kernels
+from liex_lab.runtime.kernels import ignore_outdated_kernels
 from tests.conftest import REPOSITORY
 
 
@@ -86,12 +87,12 @@ def test_kernels_of_an_earlier_version_are_compiled_again(tmp_path: Path) -> Non
     """Their index names a record type that has another name now."""
     source = """
 from typing import NamedTuple
-from numba import njit
+from liex_lab.runtime.kernels import kernel
 
 class {name}(NamedTuple):
     value: float
 
-@njit(cache=True)
+@kernel()
 def doubled(record):
     return 2.0 * record.value
 
