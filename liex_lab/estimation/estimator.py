@@ -47,12 +47,13 @@ from liex_lab.estimation.refine import (
 )
 from liex_lab.estimation.scoring import Chosen, choose, corrected, with_best, with_expected_error
 from liex_lab.forests.forest import Forest
+from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene.height_maps import HeightMaps, Segmenter, view_of
 
 
 @dataclass(frozen=True)
-class Estimates:
+class Estimates(Rows):
     """Poses of n frames in the camera frame; rows are NaN if no animal was found.
 
     Attributes:
@@ -65,13 +66,9 @@ class Estimates:
     found: NDArray[np.bool_]
     crops: HeightMaps
 
-    def __getitem__(self, rows: slice) -> Estimates:
-        """A slice of the frames."""
-        return Estimates(self.chosen[rows], self.found[rows], self.crops[rows])
-
 
 @dataclass(frozen=True)
-class Detection:
+class Detection(Rows):
     """One detected component in each of n frames, and its candidate poses.
 
     Attributes:
@@ -87,23 +84,6 @@ class Detection:
     rotations: Array
     positions: Array
     scores: Array
-
-    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> Detection:
-        """Some of the frames, by row numbers (m,), mask (n,), or slice, which copies nothing."""
-        return Detection(
-            self.crops[index],
-            self.crop_cameras[index],
-            self.rotations[index],
-            self.positions[index],
-            self.scores[index],
-        )
-
-    @staticmethod
-    def join(parts: Sequence[Detection]) -> Detection:
-        """Concatenate detections with equally many candidates per frame."""
-        names = ("crop_cameras", "rotations", "positions", "scores")
-        rest = (np.concatenate([getattr(p, name) for p in parts]) for name in names)
-        return Detection(HeightMaps.join([p.crops for p in parts]), *rest)
 
     @property
     def images(self) -> ImageSet:
@@ -510,19 +490,14 @@ def _pack(forests: list[Forest]) -> kernels.Trees:
 
     Their leaves, of different widths, are stored in one row of numbers.
     """
-    nodes = []
-    roots = []
-    n_nodes = 0
-    for forest in forests:
-        shifted = forest.nodes.copy()
-        shifted[shifted[:, 2] >= 0, 2] += n_nodes
-        nodes.append(shifted)
-        roots.append(forest.roots + n_nodes)
-        n_nodes += len(forest.nodes)
+    n_nodes = np.array([len(forest.nodes) for forest in forests])
+    first = (np.cumsum(n_nodes) - n_nodes).astype(np.int32)
+    nodes = np.concatenate([forest.nodes for forest in forests])
+    nodes[:, 2] += np.where(nodes[:, 2] >= 0, np.repeat(first, n_nodes), 0)
     sizes = np.array([forest.leaves.size for forest in forests])
     return kernels.Trees(
-        np.concatenate(nodes),
-        np.stack(roots),
+        nodes,
+        np.stack([forest.roots for forest in forests]) + first[:, None],
         np.concatenate([forest.leaves.ravel() for forest in forests]),
         np.cumsum(sizes) - sizes,
         np.array([forest.leaves.shape[1] for forest in forests]),

@@ -69,16 +69,15 @@ class Forest:
         """Join forests, with equally many values per leaf, into one of all their trees; its
         prediction is the mean over all the trees.
         """
-        first_node = np.cumsum([0, *(len(forest.nodes) for forest in forests)])
-        first_leaf = np.cumsum([0, *(len(forest.leaves) for forest in forests)])
-        nodes = []
-        for k, forest in enumerate(forests):
-            nodes.append(forest.nodes.copy())
-            inner = forest.nodes[:, 2] >= 0
-            nodes[-1][:, 2] += np.where(inner, first_node[k], -first_leaf[k]).astype(np.int32)
-        roots = [forest.roots + first for forest, first in zip(forests, first_node, strict=False)]
+        n_nodes, n_leaves = np.array([(len(one.nodes), len(one.leaves)) for one in forests]).T
+        first_node = np.cumsum(n_nodes) - n_nodes
+        first_leaf = np.cumsum(n_leaves) - n_leaves
+        nodes = np.concatenate([forest.nodes for forest in forests])
+        shift = (np.repeat(first, n_nodes) for first in (first_node, -first_leaf))
+        nodes[:, 2] += np.where(nodes[:, 2] >= 0, *shift).astype(np.int32)
+        roots = [forest.roots + first for forest, first in zip(forests, first_node, strict=True)]
         return Forest(
-            np.concatenate(nodes),
+            nodes,
             np.concatenate(roots).astype(np.int32),
             np.concatenate([forest.leaves for forest in forests]),
         )
