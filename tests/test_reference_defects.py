@@ -20,7 +20,6 @@ from liex_lab.optics import camera as cameras
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, PRIMESENSE_QVGA, Camera, Distortion, Water
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import Patches
 from liex_lab.scene.learning import learn_scene
@@ -28,6 +27,7 @@ from liex_lab.simulation.species import BY_NAME
 from tests.behaviour.test_kinematics import tables_of
 from tests.oracles.plate import Plate
 from tests.recordings.writers import depth_frames, even_times, write_moseq_folder, write_png_folder
+from tests.scene.staged import bare_floor
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 Array = NDArray[np.float64]
@@ -268,7 +268,7 @@ def test_14_the_model_sees_in_use_what_it_saw_in_training() -> None:
     picture = np.rint(plate.depth(PRIMESENSE_QVGA)).astype(np.uint16)
     bare = np.full_like(picture, 600)
     floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 600.0, PRIMESENSE_QVGA)
-    scene = replace(BackgroundSubtraction.from_floor(PRIMESENSE_QVGA, floor), area_mm2=3600.0)
+    scene = replace(bare_floor(PRIMESENSE_QVGA, floor), area_mm2=3600.0)
     used = scene.extract(picture[None].astype(np.float32), 1.0)
     lens = np.array(
         [[PRIMESENSE_QVGA.fx, PRIMESENSE_QVGA.fy, PRIMESENSE_QVGA.cx, PRIMESENSE_QVGA.cy]]

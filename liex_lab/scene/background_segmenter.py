@@ -377,21 +377,6 @@ class BackgroundSubtraction(Segmenter):
                 values *= self.stride * factor
         return crops
 
-    @staticmethod
-    def from_floor(
-        camera: Camera, floor: Floor, min_height_mm: float = 7.0
-    ) -> "BackgroundSubtraction":
-        """A segmenter whose background is the bare floor plane.
-
-        Args:
-            camera: the ideal pinhole camera.
-            floor: the floor plane in its frame.
-            min_height_mm: smaller heights above the floor are not the animal.
-        """
-        bare = floor.depth(camera.width, camera.height)
-        limit = np.maximum(bare - np.float32(min_height_mm), 0).astype(np.float32)
-        return BackgroundSubtraction(camera, floor, bare, limit, np.ones(bare.shape, np.bool_))
-
 
 def at_every_pixel(
     values: NDArray[AnyNumber], step: int, shape: tuple[int, ...]

@@ -9,9 +9,9 @@ from liex_lab.estimation import _feature_kernels as kernels
 from liex_lab.forests._kernels import VIEW
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE, Camera
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import HeightMaps
+from tests.scene.staged import bare_floor
 
 REACH = 50.0
 
@@ -24,7 +24,7 @@ class Window:
         floor = Floor.from_plane(
             np.array([np.sin(tilt), -0.4 * np.sin(tilt), np.cos(tilt)]), 700.0, camera
         )
-        scene = BackgroundSubtraction.from_floor(camera, floor)
+        scene = bare_floor(camera, floor)
         distance = 655.0 if camera_view else floor.distance_mm
         origin = np.array([[camera.width // 2 - 30, camera.height // 2 - 70]], np.int32)
         crops = HeightMaps(

@@ -21,12 +21,12 @@ from liex_lab.estimation.training import train_cascade, train_metric
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
+from tests.scene.staged import bare_floor
 
 CAMERA = Camera(300.0, 300.0, 79.5, 59.5, 160, 120)
 FLOOR = Floor.from_plane(np.array([0.06, -0.04, 1.0]), 600.0, CAMERA)
-SCENE = BackgroundSubtraction.from_floor(CAMERA, FLOOR)
+SCENE = bare_floor(CAMERA, FLOOR)
 
 
 @dataclass(frozen=True)

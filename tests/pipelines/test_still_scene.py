@@ -11,6 +11,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.learning import learn_scene
 from liex_lab.sessions.cutouts import still_scene
+from tests.scene.staged import bare_floor
 from tests.scene.test_background_segmenter import (
     CAMERA,
     SPINES,
@@ -71,7 +72,7 @@ def test_what_is_larger_than_any_animal_stays_where_only_the_bare_floor_is_known
 
     recording = recording_of([frame(PLACE[0])] * 110 + [frame((100, 30))] * 10)
     area = 24 * 16 * (600.0 / CAMERA.fx) ** 2
-    known = replace(BackgroundSubtraction.from_floor(CAMERA, FLOOR), area_mm2=area)
+    known = replace(bare_floor(CAMERA, FLOOR), area_mm2=area)
     background = still_scene(recording, known)
     inside = off(background)[72:108, 82:148]  # its corners are the median's
     assert np.abs(inside - 60.0).max() < NOISE_MM

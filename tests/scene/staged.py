@@ -8,13 +8,23 @@ from unittest.mock import patch
 import numpy as np
 
 from liex_lab.geometry import SE3
+from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.floor import Floor
 from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.recording import SyntheticSession
 from liex_lab.simulation.scene import BOX, SimulatedScene
 from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
 
 CAMERA = PRIMESENSE_QVGA_SENSOR.camera
+
+
+def bare_floor(camera: Camera, floor: Floor, min_height_mm: float = 7.0) -> BackgroundSubtraction:
+    """A segmenter whose background is the floor plane alone."""
+    bare = floor.depth(camera.width, camera.height)
+    limit = np.maximum(bare - np.float32(min_height_mm), 0).astype(np.float32)
+    return BackgroundSubtraction(camera, floor, bare, limit, np.ones(bare.shape, np.bool_))
 
 
 def view(height_mm: float, tilt_deg: float = 0.0) -> SE3:

@@ -11,9 +11,9 @@ from liex_lab.errors import EstimationError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import learn_background
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor, find_floor
 from liex_lab.scene.learning import learn_scene
+from tests.scene.staged import bare_floor
 
 CAMERA = Camera(300.0, 300.0, 79.5, 59.5, 160, 120)
 SPINES = (40.0, 115.0)
@@ -122,14 +122,14 @@ def test_heights_are_true_whatever_the_tilt_and_holes_are_filled():
     depth = floor.depth(160, 120)
     depth[50:70, 60:100] = roof[50:70, 60:100]
     depth[60, 80] = 0.0
-    crops = BackgroundSubtraction.from_floor(CAMERA, floor).extract(depth[None], 1.0)
+    crops = bare_floor(CAMERA, floor).extract(depth[None], 1.0)
     inner = crops.heights[0][48 - 6 : 48 + 6, 48 - 12 : 48 + 12] / 16.0
     np.testing.assert_allclose(inner, 20.0, atol=0.2)
 
 
 def test_an_empty_frame_is_not_found_and_costs_nothing_else():
     floor = tilted(2.0)
-    scene = BackgroundSubtraction.from_floor(CAMERA, floor)
+    scene = bare_floor(CAMERA, floor)
     stack = np.stack(
         [floor.depth(160, 120), with_box(floor, (60, 60)), np.zeros((120, 160), np.float32)]
     )
@@ -142,9 +142,7 @@ def test_what_else_may_be_the_animal_is_cut_out_in_the_same_go():
     beside = np.where(
         alone < with_box(floor, (110, 60), (10, 6)), alone, with_box(floor, (110, 60), (10, 6))
     )
-    scene = replace(
-        BackgroundSubtraction.from_floor(CAMERA, floor), area_mm2=24 * 12 * (575.0 / 300.0) ** 2
-    )
+    scene = replace(bare_floor(CAMERA, floor), area_mm2=24 * 12 * (575.0 / 300.0) ** 2)
     first, second = scene.extract_both(np.stack([alone, beside]), 1.0)
     np.testing.assert_array_equal(
         first.heights, scene.extract(np.stack([alone, beside]), 1.0).heights
@@ -158,9 +156,7 @@ def test_what_else_may_be_the_animal_is_cut_out_in_the_same_go():
 
 def test_the_long_axis_and_area_of_a_box_are_its_own():
     floor = tilted(0.0)
-    crops = BackgroundSubtraction.from_floor(CAMERA, floor).extract(
-        with_box(floor, (80, 60), (20, 8))[None], 1.0
-    )
+    crops = bare_floor(CAMERA, floor).extract(with_box(floor, (80, 60), (20, 8))[None], 1.0)
     area, angle = crops.moments[0, 1], crops.moments[0, 5]
     scale = (600.0 - 25.0) / 300.0
     assert area == pytest.approx(40 * 16 * scale**2, rel=0.03)

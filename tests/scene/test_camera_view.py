@@ -15,6 +15,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import stride_for
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
+from tests.scene.staged import bare_floor
 
 CAMERA = Camera(600.0, 600.0, 119.5, 89.5, 240, 180)
 FLOOR = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 300.0, CAMERA)
@@ -22,7 +23,7 @@ BEHIND, HIGH = 20.0, 40.0
 
 
 def scene(frame: str) -> BackgroundSubtraction:
-    bare = BackgroundSubtraction.from_floor(CAMERA, FLOOR, 3.0)
+    bare = bare_floor(CAMERA, FLOOR, 3.0)
     view = CameraView(frame, behind_mm=BEHIND, smooth_mm=0.6)
     return BackgroundSubtraction(
         CAMERA, FLOOR, bare.background, bare.limit, bare.on_floor, view=view

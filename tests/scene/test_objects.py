@@ -9,9 +9,9 @@ import pytest
 
 from liex_lab.optics.camera import SensorCard
 from liex_lab.recordings import open_recording
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.learning import learn_scene
 from liex_lab.scene.scene import Fixture
+from tests.scene.staged import bare_floor
 from tests.scene.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ def test_an_animal_that_only_turns_its_head_is_found_whole(n_frames):
     scene, sample = learn_scene(recording_of([nodding(k) for k in range(n_frames)]), SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
-    whole = BackgroundSubtraction.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
+    whole = bare_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
     np.testing.assert_allclose(crops.moments[:, 1], whole[:, 1], rtol=0.3)
     assert np.linalg.norm(crops.moments[:, 3:5] - whole[:, 3:5], axis=1).max() < 8.0
 
@@ -55,7 +55,7 @@ def test_an_animal_that_goes_from_where_the_floor_is_never_read_was_whole_before
     scene, sample = learn_scene(recording_of(frames), SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
-    whole = BackgroundSubtraction.from_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
+    whole = bare_floor(scene.camera, scene.floor).extract(sample, 1.0).moments
     np.testing.assert_allclose(crops.moments[:, 1], whole[:, 1], rtol=0.3)
 
 

@@ -14,6 +14,7 @@ from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.tracking.observations import reversed_pose
 from liex_lab.tracking.residual import OcclusionCorrection
+from tests.scene.staged import bare_floor
 
 FISH = Skeleton.load("fish")
 CAMERA = Camera(900.0, 900.0, 159.5, 119.5, 320, 240)
@@ -46,7 +47,7 @@ def drawn(turn: float, u: float = 0.0) -> tuple[Pose, np.ndarray]:
 
 
 WHOLE, PICTURE = drawn(0.4)
-BARE = BackgroundSubtraction.from_floor(CAMERA, FLOOR, 3.0)
+BARE = bare_floor(CAMERA, FLOOR, 3.0)
 KNOWN = BackgroundSubtraction(
     CAMERA, FLOOR, BARE.background, BARE.limit, BARE.on_floor, view=FISH.view
 )

@@ -12,11 +12,11 @@ from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import HeightMaps
 from liex_lab.tracking.residual import BodyResidual, median_of
 from tests.estimation.toy import SCENE, Toy, rendered, toy_mice
+from tests.scene.staged import bare_floor
 
 LARGE = Camera(
     1150.0, 1150.0, 319.5, 239.5, 640, 480
@@ -60,7 +60,7 @@ def test_the_true_pose_explains_a_clean_picture_and_wrong_ones_do_not(clean, sur
 
 def test_a_crop_of_every_second_pixel_is_explained_as_well(clean, surface):
     few = clean.pose[slice(0, 6)]
-    scene = BackgroundSubtraction.from_floor(LARGE, LARGE_FLOOR)
+    scene = bare_floor(LARGE, LARGE_FLOOR)
     depths = rendered(clean.skeleton, few, camera=LARGE, floor=LARGE_FLOOR).astype(np.float32)
     crops = scene.extract(depths, 1.0)
     assert (crops.step > 1).all()
