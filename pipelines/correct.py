@@ -8,7 +8,7 @@ replaces the folder as a whole, and its predecessor is removed only once the new
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from liex_lab.sessions.folder import file_facts
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, frame_count
 from liex_lab.tracking import curve, observations, smoother
-from liex_lab.tracking.track import COLUMNS, CORRECTED, Flip, Track, ends_of
+from liex_lab.tracking.track import CORRECTED, Flip, Track, ends_of
 
 from .session import measure_behaviour
 
@@ -329,8 +329,8 @@ def _turned_round(
         | (exchanged & (np.einsum("nd,nd->n", was, now) > 0.0))  # ignored: bridged as before
     )
     trusted = near & (track.flag == "")
-    for name in {*COLUMNS} - {"times_ns"}:
-        getattr(track, name)[near & ~lost] = getattr(again.track, name)[near & ~lost]
+    for column in fields(track)[2:]:  # all but skeleton and times
+        getattr(track, column.name)[near & ~lost] = getattr(again.track, column.name)[near & ~lost]
     track.flag[trusted] = ""
     rows = np.flatnonzero(lost & exchanged)
     turned = observations.reversed_pose(track.skeleton, track.pose[rows])

@@ -11,7 +11,7 @@ of a share is Wilson's (1927).
 import re
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED, frame_words
 from liex_lab.errors import LiexError, one_line
+from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.text_files import clock_s, number, read_texts
 from liex_lab.tracking.track import Track
 
@@ -134,7 +135,7 @@ def words_of(
 
 
 @dataclass(frozen=True)
-class LabelledTrack:
+class LabelledTrack(Rows):
     """A track and the word of each of its frames.
 
     Attributes:
@@ -148,30 +149,12 @@ class LabelledTrack:
     track: Track
     words: NDArray[np.str_]
     animal: str
-    wall_mm: Array | None = None
+    wall_mm: Array
     truth: Array | None = field(default=None, repr=False)
-
-    def __post_init__(self) -> None:
-        if self.wall_mm is None:
-            object.__setattr__(self, "wall_mm", np.full(len(self.words), np.nan))
 
     def __len__(self) -> int:
         """The number of frames."""
         return len(self.words)
-
-    def __getitem__(self, rows: slice | NDArray[np.int64]) -> "LabelledTrack":
-        """Some of its frames."""
-        assert self.wall_mm is not None
-        truth = None if self.truth is None else self.truth[rows]
-        return LabelledTrack(
-            some_rows(self.track, rows), self.words[rows], self.animal, self.wall_mm[rows], truth
-        )
-
-
-def some_rows(track: Track, rows: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Track:
-    """A track of some rows (a slice, indices, or a mask (n,)) of a track of n frames."""
-    columns = [getattr(track, f.name)[rows] for f in fields(Track) if f.name != "skeleton"]
-    return Track(track.skeleton, *columns)
 
 
 # Scores of recognised actions: frame-wise F1, segmental F1@50, confusion matrix.

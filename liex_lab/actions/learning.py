@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED, runs_of
-from liex_lab.actions.labels import LabelledTrack, some_rows, timeline_scores
+from liex_lab.actions.labels import LabelledTrack, timeline_scores
 from liex_lab.actions.timeline import (
     CLOCK_HZ,
     CLOCKS_HZ,
@@ -335,7 +335,7 @@ def position_descriptor(track: Track) -> Array:
     if observed.sum() < 2:
         return np.zeros(14 * 3 * track.skeleton.n_joints + 6)
     joints = _lerp(track.joints_mm[observed], _places(observed.sum()))
-    root = some_rows(track, observed).root
+    root = track[observed].root
     base = np.concatenate([root.translation.mean(axis=0), so3.log(so3.mean(root.rotation))])
     return np.concatenate([pyramid(joints.reshape(N_FRAMES, -1)), base])
 
@@ -360,7 +360,7 @@ def _resampled(track: Track) -> tuple[SE3, Array]:
     n = int(observed.sum())
     if n < 2:
         return SE3.identity(N_FRAMES), np.zeros((N_FRAMES, track.skeleton.n_joints, 3))
-    kept = some_rows(track, observed)
+    kept = track[observed]
     at = _places(n)
     low = np.minimum(at.astype(int), n - 2)
     before, after = (SE3(kept.root_rotation[rows], kept.root_mm[rows]) for rows in (low, low + 1))

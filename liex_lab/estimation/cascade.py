@@ -39,7 +39,7 @@ from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Forest, Samples, predict, predict_each
 from liex_lab.forests.grow import grow_forest
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.memory import check_index, check_shapes
+from liex_lab.runtime.memory import Rows, check_index, check_shapes
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene._blob_kernels import N_MOMENTS
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
@@ -109,7 +109,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class ImageSet:
+class ImageSet(Rows):
     """Height maps with their crop cameras and moments.
 
     Attributes:
@@ -130,10 +130,6 @@ class ImageSet:
             ("crop_cameras", self.crop_cameras, ("m", N_CROP_CAMERA)),
             ("moments", self.moments, ("m", N_MOMENTS)),
         )
-
-    def __getitem__(self, rows: NDArray[np.int64]) -> ImageSet:
-        """Select rows (k,) of the images."""
-        return ImageSet(self.heights[rows], self.crop_cameras[rows], self.moments[rows])
 
 
 @dataclass(frozen=True)
@@ -400,7 +396,7 @@ def residuals(
 
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(Rows):
     """True poses of m images, in their view frames.
 
     Attributes:
@@ -415,7 +411,7 @@ class Truth:
 
 
 @dataclass(frozen=True)
-class TrainingSet:
+class TrainingSet(Rows):
     """Images with their true poses in the view frame.
 
     Attributes:
@@ -431,23 +427,6 @@ class TrainingSet:
     truth: Truth
     size: Array
     animal: NDArray[np.bool_]
-
-    @staticmethod
-    def join(parts: list[TrainingSet]) -> TrainingSet:
-        """Concatenate the images of multiple sets."""
-        images, truths = (
-            [
-                np.concatenate(column)
-                for column in zip(*(vars(one).values() for one in some), strict=True)
-            ]
-            for some in ([p.images for p in parts], [p.truth for p in parts])
-        )
-        return TrainingSet(
-            ImageSet(*images),
-            Truth(*truths),
-            np.concatenate([p.size for p in parts]),
-            np.concatenate([p.animal for p in parts]),
-        )
 
 
 def aim_about(bone: Array, direction: Array, axes: NDArray[np.bool_]) -> Array:

@@ -29,6 +29,7 @@ from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.forests._kernels import VIEW
 from liex_lab.forests.forest import Samples, predict
 from liex_lab.geometry import SE3, so3
+from liex_lab.runtime.memory import Rows
 from liex_lab.scene.height_maps import mm_per_px, moment_columns
 
 LOG_UNIT = 10.0  # of logarithms that a forest predicts: its leaves are kept as float16
@@ -36,7 +37,7 @@ LEAST_MM = 0.1  # least expected error, at the reference length
 
 
 @dataclass(frozen=True)
-class Chosen:
+class Chosen(Rows):
     """One pose for each of n frames, in the view frame of the frame; NaN if no animal was found.
 
     Attributes:
@@ -69,10 +70,6 @@ class Chosen:
     fit: Array
     frame_scale: Array
     scale_trust: Array
-
-    def __getitem__(self, rows: slice) -> "Chosen":
-        """A slice of the frames."""
-        return Chosen(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def spread_over(self, usable: NDArray[np.bool_]) -> "Chosen":
         """These poses as the usable ones of n frames, in order; rows of NaN elsewhere."""

@@ -302,10 +302,7 @@ class Build:
             pose.angles.copy(),
             pose.scale.copy(),
         )
-        whole.root.rotation[rows] = right.root.rotation
-        whole.root.translation[rows] = right.root.translation
-        whole.angles[rows] = right.angles
-        whole.scale[rows] = right.scale
+        whole.put(rows, right)
         return whole
 
 

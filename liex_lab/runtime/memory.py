@@ -304,6 +304,15 @@ class Rows:
                 columns[field.name] = np.concatenate(values)
         return cls(**columns)
 
+    def put(self, index: Any, other: Self) -> None:
+        """Replace some rows, in place, by all rows of another record."""
+        for field in fields(self):  # type: ignore[arg-type]
+            own, new = getattr(self, field.name), getattr(other, field.name)
+            if isinstance(own, Rows):
+                own.put(index, new)
+            elif self._has_rows(field.name):
+                own[index] = new
+
     def _has_rows(self, name: str) -> bool:
         return name not in self.SHARED and isinstance(getattr(self, name), np.ndarray | Rows)
 

@@ -15,8 +15,7 @@ camera, see `CropCamera`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from liex_lab.body.skeleton import MOUSE_VIEW, CameraView
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.memory import check_shapes
+from liex_lab.runtime.memory import Rows, check_shapes
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import N_MOMENTS, BlobMoments
@@ -136,7 +135,7 @@ CROP = 96  # pixels per side of a height map
 
 
 @dataclass(frozen=True)
-class HeightMaps:
+class HeightMaps(Rows):
     """Height maps of one animal in n frames, with moments of its mass in the view frame.
 
     The view frame is the arena frame, or (camera_view) an upright frame whose z axis is the
@@ -195,25 +194,6 @@ class HeightMaps:
             np.full(n, distance_mm),
             np.zeros(n, np.int64),
         )
-
-    @staticmethod
-    def join(parts: Sequence[HeightMaps]) -> HeightMaps:
-        """Concatenate batches, at least one."""
-        return HeightMaps(
-            *(
-                np.concatenate([getattr(part, field.name) for part in parts])
-                for field in fields(HeightMaps)
-            )
-        )
-
-    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.int64] | slice) -> HeightMaps:
-        """A batch of the rows at `index`: mask (n,), row numbers, or a slice."""
-        return HeightMaps(*(getattr(self, field.name)[index] for field in fields(self)))
-
-    def put(self, rows: NDArray[np.int64], other: HeightMaps) -> None:
-        """Replace the rows (m,), in place, by all m rows of another batch."""
-        for field in fields(self):
-            getattr(self, field.name)[rows] = getattr(other, field.name)
 
     @property
     def rows(self) -> CropRows:

@@ -26,8 +26,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.pose import Pose
-from liex_lab.body.skeleton import Skeleton
 from liex_lab.recordings.timestamps import GAP_FACTOR, median_step
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation, cost_of_the_other
@@ -176,7 +174,8 @@ def track_whole(
             first = max(start, part.start - MARGIN)
             around = slice(first, min(stop, part.stop + MARGIN))
             pose = observed[around].pose(path[around])
-            _reverse(subject.skeleton, pose, turned[around])
+            for t in np.repeat(np.arange(len(pose.scale)), turned[around]):
+                pose.put([t], reversed_pose(subject.skeleton, pose[t : t + 1]))
             measured = seconds[around], pose, error[around]
             curve = smooth(subject.skeleton, *measured, subject.length_mm, tuning.motion)
             curve = curve[part.start - first : part.stop - first]
@@ -300,16 +299,6 @@ def _half_turns(
         for end, k in zip(ends, np.searchsorted(rows, ends), strict=True)
         if 0 < k < len(rows) and ahead(rows[k - 1]) @ ahead(rows[k]) < 0.0
     ]
-
-
-def _reverse(skeleton: Skeleton, pose: Pose, turned: NDArray[np.int64]) -> None:
-    """Reverse poses (n) a given number of times (n,) each, in place."""
-    for t in np.repeat(np.arange(len(turned)), turned):
-        other = reversed_pose(skeleton, pose[t : t + 1])
-        pose.root.rotation[t] = other.root.rotation[0]
-        pose.root.translation[t] = other.root.translation[0]
-        pose.angles[t] = other.angles[0]
-        pose.scale[t] = other.scale[0]
 
 
 def _admit(

@@ -17,7 +17,7 @@ from liex_lab.body._skinning_kernels import place_joints
 from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.memory import Allocator, blocks
+from liex_lab.runtime.memory import Allocator, Rows, blocks
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
@@ -27,7 +27,7 @@ N_HYPOTHESES = 4
 
 
 @dataclass(frozen=True)
-class Observations:
+class Observations(Rows):
     """Hypotheses (n, H) of n frames, NaN if absent.
 
     The first is the single-frame estimate. Single precision, as a recording may last hours.
@@ -124,22 +124,6 @@ class Observations:
         self.place[:, h] = pose.root.translation
         self.scale[:, h] = pose.scale
         self.angles[:, h] = pose.angles[:, 1:][:, self.skeleton.axes[1:]]
-
-    @staticmethod
-    def join(parts: Sequence[Observations]) -> Observations:
-        """Concatenate observations of consecutive frames.
-
-        Args:
-            parts: observations of one animal in order of time, at least one.
-        """
-        return Observations(
-            parts[0].skeleton,
-            *(np.concatenate([getattr(p, name) for p in parts]) for name in COLUMNS),
-        )
-
-    def __getitem__(self, frames: slice) -> Observations:
-        """Some consecutive frames, as views."""
-        return Observations(self.skeleton, *(getattr(self, name)[frames] for name in COLUMNS))
 
     def __len__(self) -> int:
         """The number of frames n."""

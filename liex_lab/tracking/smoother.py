@@ -42,6 +42,7 @@ from pydantic import TypeAdapter
 from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
+from liex_lab.runtime import memory
 from liex_lab.tracking import _smoother_kernels as kernels
 from liex_lab.tracking.observations import Array, joints_of
 from liex_lab.tracking.track import Track
@@ -275,7 +276,7 @@ _PASSES = 4
 
 
 @dataclass(frozen=True)
-class SmoothedCurve:
+class SmoothedCurve(memory.Rows):
     """A smoothed curve of n frames, arena frame, with its posterior spread.
 
     Attributes:
@@ -296,10 +297,6 @@ class SmoothedCurve:
     sd_bend: Array
     used: NDArray[np.bool_]
 
-    def __getitem__(self, rows: slice) -> SmoothedCurve:
-        """Some consecutive frames."""
-        return SmoothedCurve(self.pose[rows], *(getattr(self, name)[rows] for name in _ROWS))
-
     @staticmethod
     def unknown(n: int, n_joints: int) -> SmoothedCurve:
         """A curve without measurements: all NaN, none used."""
@@ -308,9 +305,6 @@ class SmoothedCurve:
         none = nan[:, 0, 0, 0]
         pose = Pose(SE3(nan[:, 0], axes), nan[..., 0], none)
         return SmoothedCurve(pose, nan[..., 0], none, nan[:, 0], axes, axes, np.zeros(n, np.bool_))
-
-
-_ROWS = ("joints", "error_mm", "cov_middle_mm2", "sd_turn", "sd_bend", "used")
 
 
 def smooth(

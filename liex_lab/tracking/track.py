@@ -8,7 +8,7 @@ positions, bone scale, predicted error, flip posterior and flags. The tables `fr
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -19,7 +19,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.memory import Allocator, blocks
+from liex_lab.runtime.memory import Allocator, Rows, blocks
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ FLAGS = {
 
 
 @dataclass(frozen=True)
-class Track:
+class Track(Rows):
     """Poses over time: one row for EVERY frame of the recording, NaN without a pose.
 
     Attributes:
@@ -165,19 +165,6 @@ class Track:
             column(flag, "<U12"),
         )
 
-    @staticmethod
-    def join(parts: list[Track]) -> Track:
-        """One track from consecutive parts of the same recording.
-
-        Args:
-            parts: tracks of one skeleton in order of time, at least one.
-
-        Returns:
-            All their rows.
-        """
-        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in COLUMNS)
-        return Track(parts[0].skeleton, *columns)
-
     def put_pose(self, rows: NDArray[np.int64], pose: Pose) -> None:
         """Write poses into some rows, in place, except `uv_px`, which depends on the camera.
 
@@ -189,10 +176,6 @@ class Track:
         self.root_mm[rows] = pose.root.translation
         self.angles_rad[rows] = pose.angles
         self.joints_mm[rows] = pose.joints(self.skeleton)
-
-    def __getitem__(self, rows: slice) -> Track:
-        """Some consecutive frames, as views."""
-        return Track(self.skeleton, *(getattr(self, name)[rows] for name in COLUMNS))
 
     @property
     def n_frames(self) -> int:
@@ -236,9 +219,6 @@ class Track:
     def spine_mm(self) -> Array:
         """(n,) length of the fitted (longest) chain, all its bones added up, mm."""
         return self.scale * self.skeleton.length
-
-
-COLUMNS = tuple(field.name for field in fields(Track) if field.name != "skeleton")
 
 
 @dataclass(frozen=True)

@@ -113,11 +113,7 @@ class AgentTrack:
             if not rate_hz
             else thinned(self.observations.times_ns, rate_hz)
         )
-        thinned_out = Observations(
-            self.observations.skeleton,
-            *(getattr(self.observations, name)[rows] for name in COLUMNS),
-        )
-        track = track_whole(self.subject, thinned_out).track
+        track = track_whole(self.subject, self.observations[rows]).track
         one = LabelledTrack(
             track, self.words[rows], self.animal, self.wall_mm[rows], self.truth[rows].astype(float)
         )

@@ -17,7 +17,7 @@ from skops import io
 from threadpoolctl import threadpool_limits
 
 from liex_lab.actions import storage
-from liex_lab.actions.labels import LabelledTrack, read_labels, some_rows, timeline_scores, words_of
+from liex_lab.actions.labels import LabelledTrack, read_labels, timeline_scores, words_of
 from liex_lab.actions.learning import doubtful_segments, learn, leave_one_animal_out
 from liex_lab.actions.storage import load_action_model, save_action_model
 from liex_lab.actions.timeline import SemiMarkovModel, TimelineModel
@@ -98,7 +98,7 @@ def test_a_network_says_the_same_bits_on_any_number_of_cores() -> None:
 def test_a_cut_out_sequence_gets_one_word(model: TimelineModel) -> None:
     one = going_and_staying(13)
     start = int(np.flatnonzero(one.words == STAY)[0])
-    assert model.name(some_rows(one.track, slice(start + 2, start + 20))) == STAY
+    assert model.name(one.track[start + 2 : start + 20]) == STAY
 
 
 def test_a_model_read_back_says_the_same_and_its_file_holds_no_pickle(
@@ -193,7 +193,7 @@ def test_each_animal_is_scored_by_a_model_that_has_not_seen_it() -> None:
 def test_labels_of_one_word_only_are_refused() -> None:
     one = going_and_staying(1)
     with pytest.raises(LiexError, match="at least two actions"):
-        learn([LabelledTrack(one.track, np.full(len(one), GO), "m")])
+        learn([replace(one, words=np.full(len(one), GO))])
 
 
 def test_the_stretches_suggested_do_not_overlap_and_lie_in_the_recording(

@@ -60,7 +60,8 @@ def going_and_staying(
         animal, clock, np.cumsum(np.where(going, 3.0 * length, 0.0)) / rate_hz, 0.4 * np.sin(clock)
     )
     track.joints_mm[:] += rng.normal(0.0, 0.3, track.joints_mm.shape)
-    return LabelledTrack(track, np.where(going, GO, STAY), f"{animal}-{seed}")
+    words, wall_mm = np.where(going, GO, STAY), np.full(len(going), np.nan)
+    return LabelledTrack(track, words, f"{animal}-{seed}", wall_mm)
 
 
 def few_steps() -> AbstractContextManager[object]:

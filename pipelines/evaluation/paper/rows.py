@@ -578,12 +578,7 @@ def _unseen(skeleton: Skeleton, model: Model, n: int) -> TrainingSet:
     recipe = _near_home_size(skeleton)
     first = recipe.n_images + recipe.n_correction + recipe.n_calibration
     data = rendered_set(skeleton, model.method, recipe, first, n, silent)
-    rows = np.flatnonzero(data.animal)[:n]
-
-    def some(part: Any) -> Any:
-        return type(part)(*(getattr(part, name)[rows] for name in type(part).__annotations__))
-
-    return TrainingSet(some(data.images), some(data.truth), data.size[rows], data.animal[rows])
+    return data[np.flatnonzero(data.animal)[:n]]
 
 
 def _follow(
