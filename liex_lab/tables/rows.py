@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.special import erf
 
@@ -29,7 +30,6 @@ from liex_lab.tables.schema import (
     ROOT_COVARIANCES,
     ROWS_PER_GROUP,
     Block,
-    Words,
     to_pandas,
 )
 from liex_lab.tracking.track import Flip, Track
@@ -132,7 +132,7 @@ class Rows:
             "flag": track.flag,
         }
 
-    def _in_arena(self) -> tuple[Array, Words]:
+    def _in_arena(self) -> tuple[Array, pa.DictionaryArray]:
         """Distance (n,) mm of each frame's centroid from the nearest wall, and its zones."""
         wall = np.empty(self.track.n_frames)
         codes = np.empty(self.track.n_frames, np.int64)
@@ -143,7 +143,7 @@ class Rows:
             codes[part] = [
                 known.setdefault(name, len(known)) for name in zone_names(self.zones, xy)
             ]
-        return wall, Words(codes, tuple(known))
+        return wall, pa.DictionaryArray.from_arrays(codes, list(known))
 
     def _pose_rows(self, part: slice) -> Block:
         track = self.track[part]
@@ -151,8 +151,8 @@ class Rows:
         return {
             **self._keys,
             **self._when(part, n_joints),
-            "joint": Words(
-                np.tile(np.arange(n_joints), track.n_frames), tuple(track.skeleton.names)
+            "joint": pa.DictionaryArray.from_arrays(
+                np.tile(np.arange(n_joints), track.n_frames), list(track.skeleton.names)
             ),
             **{f"{axis}_mm": track.joints_mm[:, :, k].ravel() for k, axis in enumerate("xyz")},
             **{f"{axis}_px": track.uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
@@ -179,7 +179,9 @@ class Rows:
         return {
             **self._keys,
             **self._when(part, n_rows),
-            "joint": Words(np.tile(np.arange(n_rows), len(turn)), ("root", *track.skeleton.names)),
+            "joint": pa.DictionaryArray.from_arrays(
+                np.tile(np.arange(n_rows), len(turn)), ["root", *track.skeleton.names]
+            ),
             **_xyz("w{}_rad", turn),
             **_xyz("sd_w{}_rad", spread),
             **_xyz("t{}_mm", shift),

@@ -19,7 +19,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import ACROSS_GAPS
 from liex_lab.actions.vocabulary import WORDS
@@ -254,10 +253,9 @@ def _is_array(value: Any) -> bool:
 
 
 def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
-    """One column: a scalar is repeated for all rows, `Words` are a dictionary encoding."""
-    if isinstance(value, Words):
-        codes = value.codes.astype(np.int32)
-        return pa.DictionaryArray.from_arrays(codes, list(value.words)).cast(kind)
+    """One column: a scalar is repeated for all rows."""
+    if isinstance(value, pa.DictionaryArray):
+        return value.cast(kind)
     if not _is_array(value):
         return pa.repeat(pa.scalar(value, kind), n)
     if kind == pa.string():
@@ -265,34 +263,12 @@ def _arrow_column(value: Any, kind: pa.DataType, n: int) -> pa.Array:
     return pa.array(np.asarray(value), kind)
 
 
-@dataclass(frozen=True)
-class Words:
-    """A column with few different names, as a dictionary encoding: `words[codes]`.
-
-    It avoids a Python string per row.
-
-    Attributes:
-        codes: (n,) index of each row's word.
-        words: the different words.
-    """
-
-    codes: NDArray[np.int64]
-    words: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.codes)
-
-    def __getitem__(self, rows: slice) -> "Words":
-        """Some consecutive rows."""
-        return Words(self.codes[rows], self.words)
-
-
 def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.DataFrame:
     """A block as a data frame of the schema's dtypes, equal to the table read back.
 
     Args:
         schema: the columns; those missing in the block are left out.
-        block: column -> one value for all rows, an array, or `Words`.
+        block: column -> one value for all rows, an array, or a `pyarrow.DictionaryArray`.
         copy: False if the table may share the block's arrays.
     """
     n = max((len(v) for v in block.values() if _is_array(v)), default=1)
@@ -301,8 +277,8 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
         if column.name not in block:
             continue
         value = block[column.name]
-        if isinstance(value, Words):
-            value = np.array(value.words, dtype=object)[value.codes]
+        if isinstance(value, pa.DictionaryArray):
+            value = value.to_numpy(zero_copy_only=False)
         elif not _is_array(value):
             value = [value] * n
         dtype = "str" if column.dtype == "string" else column.dtype
