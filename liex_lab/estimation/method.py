@@ -153,13 +153,10 @@ class Method:
         Unset fields that only some animals have are omitted.
         """
         return {
-            name: _plain_plan(value) if name in _PLANS and value else value
+            name: _plain_plan(value._asdict()) if isinstance(value, GrowthPlan) else value
             for name, value in asdict(self).items()
             if name not in _UNSET or value != _UNSET[name]
         }
-
-
-_PLANS = ("regressors", "metric", "pruner", "corrector", "proposals")
 
 
 def _plain_plan(plan: dict[str, Any]) -> dict[str, Any]:

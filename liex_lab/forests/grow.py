@@ -11,7 +11,6 @@ out-of-bag predictions are independent of the image. `boost_forest` grows pairs 
 residuals of those before them (Friedman, Stochastic gradient boosting, 2002).
 """
 
-from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,8 +38,7 @@ _N_SECOND = 1500
 _N_KEPT = 12
 
 
-@dataclass(frozen=True)
-class GrowthPlan:
+class GrowthPlan(NamedTuple):
     """Settings of tree growth.
 
     Shares are of the tests that are tried at a node; the rest compare two probes (Eq. 15).
@@ -70,11 +68,6 @@ class GrowthPlan:
     bag_share: float
     max_leaf: int = 0
 
-    @property
-    def least_to_split(self) -> int:
-        """Fewest samples of a node that is split."""
-        return max(2 * self.min_leaf, self.max_leaf + 1)
-
 
 class _SampleArrays(NamedTuple):
     """`Samples` and their labels (N, D) for the kernels."""
@@ -85,18 +78,6 @@ class _SampleArrays(NamedTuple):
     views: Any
     scalars: Any
     labels: Any
-
-
-class _Growth(NamedTuple):
-    """The part of a `GrowthPlan` that the kernels read."""
-
-    max_depth: int
-    min_leaf: int
-    least_to_split: int
-    n_tests: int
-    one_probe_share: float
-    scalar_share: float
-    depth_share: float
 
 
 class _Scratch(NamedTuple):
@@ -158,7 +139,7 @@ def grow_forest(
             samples.scalars,
             labels,
         ),
-        _Growth(*(getattr(plan, name) for name in _Growth._fields)),
+        plan,
         order,
         starts,
         seeds,
@@ -204,7 +185,7 @@ def boost_forest(
     trees = []
     for first in range(0, plan.n_trees, _TREES_A_STAGE):
         n = min(_TREES_A_STAGE, plan.n_trees - first)
-        stage, _ = grow_forest(samples, left, everything, replace(plan, n_trees=n), rng)
+        stage, _ = grow_forest(samples, left, everything, plan._replace(n_trees=n), rng)
         left -= shrinkage * predict(stage, samples)
         # the mean over all trees weights this stage's with n / n_trees
         share = np.float32(shrinkage * (plan.n_trees / n))
@@ -464,7 +445,7 @@ def _grow_tree(samples, growth, members, seed, nodes, leaves, counts):
         here = members[first:stop]
         middle = 0
         if (
-            here.size >= growth.least_to_split
+            here.size >= max(2 * min_leaf, growth.max_leaf + 1)
             and depth < growth.max_depth
             and _find_split(samples, growth, here, state, scratch, best)
         ):

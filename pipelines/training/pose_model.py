@@ -20,7 +20,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,7 @@ from liex_lab.estimation.training import (
     with_facing,
     with_settler,
 )
+from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3
 from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.processes import serial_products
@@ -564,7 +565,11 @@ class Training:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values of the training, a cache key: equal values mean equal training."""
-        return {"recipe": vars(self.recipe), "plan": asdict(self.plan)}
+        plan = {
+            name: value._asdict() if isinstance(value, GrowthPlan) else value
+            for name, value in vars(self.plan).items()
+        }
+        return {"recipe": vars(self.recipe), "plan": plan}
 
 
 BASELINES: dict[str, baseline.ForestPlan | baseline.CnnPlan] = {

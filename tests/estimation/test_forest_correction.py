@@ -20,7 +20,7 @@ def taught(n: int) -> Model:
     model = trained("default").model
     usual = METHODS["default"].corrector
     assert usual is not None
-    plan = replace(usual, n_trees=40, min_leaf=10, n_tests=60)
+    plan = usual._replace(n_trees=40, min_leaf=10, n_tests=60)
     method = replace(model.method, corrector=plan)
     model = replace(model, cascade=replace(model.cascade, method=method))
     return with_corrector(model, training_set(toy_mice(n, 11), method), np.random.default_rng(4))

@@ -41,7 +41,7 @@ def numbers() -> tuple[Samples, np.ndarray]:
 @pytest.mark.parametrize("n_trees", [1, 5])
 def test_a_boosted_forest_is_its_stages_added_up(numbers, n_trees):
     samples, labels = numbers
-    plan = replace(PLAN, n_trees=n_trees)
+    plan = PLAN._replace(n_trees=n_trees)
     boosted = boost_forest(samples, labels, plan, 0.3, np.random.default_rng(2))
     assert boosted.n_trees == n_trees  # none is lost of an odd number
     mean = labels.mean(axis=0)

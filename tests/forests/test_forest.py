@@ -49,7 +49,7 @@ def grown(bumps, **changes) -> tuple[Forest, np.ndarray]:
     """A forest of the bumps, and which image each tree was grown on."""
     samples, labels = bumps
     keep = np.ones(len(samples), bool)
-    return grow_forest(samples, labels, keep, replace(PLAN, **changes), np.random.default_rng(0))
+    return grow_forest(samples, labels, keep, PLAN._replace(**changes), np.random.default_rng(0))
 
 
 def test_descents_agree_with_the_walk_a_reader_would_write(bumps):
