@@ -131,23 +131,16 @@ class Board:
         n_failed: finished jobs that failed.
     """
 
-    def __init__(
-        self,
-        n_jobs: int,
-        write_line: Callable[[str], None],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, n_jobs: int, write_line: Callable[[str], None]) -> None:
         """Create a board on which no job has begun.
 
         Args:
             n_jobs: total number of jobs.
             write_line: prints a line.
-            clock: monotonic clock, s.
         """
         self._n = n_jobs
         self._write_line = write_line
-        self._clock = clock
-        self._began = clock()
+        self._began = time.monotonic()
         self._running: dict[str, float] = {}  # job -> completed fraction
         self.n_ended = self.n_failed = 0
 
@@ -186,7 +179,7 @@ class Board:
     def left_s(self) -> float | None:
         """Estimated seconds until all jobs are done; None before any progress."""
         share = self.share
-        spent = self._clock() - self._began
+        spent = time.monotonic() - self._began
         return spent * (1.0 - share) / share if share > 0 else None
 
     @property

@@ -13,7 +13,7 @@ import os
 import shutil
 import struct
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import IO, Annotated, Any
@@ -85,15 +85,12 @@ class Checkpoint:
         columns: the observations on disk.
     """
 
-    def __init__(
-        self, folder: Path, facts: Mapping[str, Any], clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, folder: Path, facts: Mapping[str, Any]) -> None:
         """Begin, or resume a session with the same provenance.
 
         Args:
             folder: the folder NAME.part; created if needed.
             facts: the session's provenance, serialisable as JSON.
-            clock: monotonic seconds.
 
         Raises:
             SessionError: another process is writing the session.
@@ -106,7 +103,6 @@ class Checkpoint:
             ) from None
         self._held = _locked(folder)
         self.folder = folder
-        self._clock = clock
         key = hashlib.sha256(json.dumps(facts, sort_keys=True, default=str).encode()).hexdigest()
         state = None
         with suppress(OSError, ValueError):  # nothing to resume from
@@ -119,7 +115,7 @@ class Checkpoint:
         self.n_interruptions = state.interruptions
         (folder / _SEEN).mkdir(exist_ok=True)
         self.columns = Columns(folder / _SEEN)
-        self._last = clock()
+        self._last = time.monotonic()
         replay, resumed = folder / LOGS[0], folder / _RESUMED
         if resumed.is_file():
             append_rrd(resumed, replay)
@@ -135,7 +131,7 @@ class Checkpoint:
     @property
     def due(self) -> bool:
         """Whether the last checkpoint was `EVERY_S` ago or longer."""
-        return self._clock() - self._last >= EVERY_S
+        return time.monotonic() - self._last >= EVERY_S
 
     def save(self, n_frames: int, seconds: float, replay: int, messages: int) -> None:
         """Record that everything up to a frame is on disk.
@@ -176,7 +172,7 @@ class Checkpoint:
         for log in state.logs:
             durable.sync_file(self.folder / log)
         durable.write_whole(self.folder / _STATE, state.model_dump_json())
-        self.state, self._last = state, self._clock()
+        self.state, self._last = state, time.monotonic()
 
     def join_replay(self) -> None:
         """Complete session.rrd, all of whose parts are closed."""

@@ -8,6 +8,7 @@ import shutil
 import time
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -232,9 +233,12 @@ def test_columns_grow_and_are_cut_back(tmp_path: Path) -> None:
     again.close()
 
 
-def test_checkpoints_are_taken_by_a_clock_that_never_jumps(tmp_path: Path) -> None:
+def test_checkpoints_are_taken_by_a_clock_that_never_jumps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now = [5.0]
-    held = Checkpoint(tmp_path / "x.part", {}, lambda: now[0])
+    monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    held = Checkpoint(tmp_path / "x.part", {})
     due = [held.due]
     now[0] += checkpoint.EVERY_S
     due.append(held.due)

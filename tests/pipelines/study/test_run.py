@@ -22,6 +22,7 @@ from liex_lab import api, cli
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
+from liex_lab.runtime import progress
 from liex_lab.runtime.progress import Board
 from liex_lab.sessions.corrections import Description
 from liex_lab.sessions.verdict import Verdict
@@ -407,10 +408,11 @@ def test_the_bundled_slurm_file_loads_and_slips_are_told(tmp_path: Path) -> None
         SlurmTable.load(tmp_path / "none.toml")
 
 
-def test_a_board_says_how_long_it_will_take() -> None:
+def test_a_board_says_how_long_it_will_take(monkeypatch: pytest.MonkeyPatch) -> None:
     lines: list[str] = []
     now = [0.0]
-    board = Board(4, lines.append, lambda: now[0])
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    board = Board(4, lines.append)
     board.report("a", 5, 10, "measuring")
     now[0] = 10.0
     assert board.share == pytest.approx(1 / 8)
