@@ -7,7 +7,7 @@ serves as the baseline.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -383,49 +383,3 @@ DESCRIPTORS: dict[str, Callable[[Track], Array]] = {
     "tangent": tangent_descriptor,
     "joints": position_descriptor,
 }
-
-
-@dataclass(frozen=True)
-class SequenceForest:
-    """A forest of 50 trees, 20 deep, on one of the `DESCRIPTORS`.
-
-    Attributes:
-        descriptor: 'tangent' or 'joints'.
-        forest: the fitted `RandomForestClassifier`.
-    """
-
-    descriptor: str
-    forest: Any
-
-    @staticmethod
-    def learn(descriptor: str, rows: Array, words: Sequence[str], seed: int) -> "SequenceForest":
-        """A forest from the descriptors of sequences and their words.
-
-        Args:
-            descriptor: which of the `DESCRIPTORS` the rows are.
-            rows: (n, D) descriptors.
-            words: (n) word of each sequence.
-            seed: of the forest.
-        """
-        from sklearn.ensemble import RandomForestClassifier
-
-        forest = RandomForestClassifier(50, max_depth=20, random_state=seed)
-        return SequenceForest(descriptor, forest.fit(rows, list(words)))
-
-    def name(self, rows: Array) -> list[str]:
-        """The words of n sequences: the largest class of the averaged leaves.
-
-        Args:
-            rows: (n, D) descriptors.
-        """
-        return [str(word) for word in self.forest.predict(rows)]
-
-
-def describe(descriptor: str, tracks: Sequence[Track]) -> Array:
-    """The descriptors (n, D) of n sequences, at least one.
-
-    Args:
-        descriptor: one of the `DESCRIPTORS`.
-        tracks: the sequences.
-    """
-    return np.stack([DESCRIPTORS[descriptor](track) for track in tracks])

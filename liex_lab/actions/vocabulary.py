@@ -123,105 +123,100 @@ class Definition:
         return f"{self.sentence} (checked: {', '.join(checked)})"
 
 
-def _defined(pattern: str, *limits: Limit) -> Definition:
-    return Definition(pattern, limits)
-
-
 _REARS = Limit("raised_bl", least=0.4)
 WORDS: dict[str, dict[str, Definition]] = {
     "fish": {
-        "scoot": _defined(
+        "scoot": Definition(
             "forward swim with tail beats, {0} to {1} lengths/s, bends below about {2} degrees in "
             "all, no turn",
-            Limit("speed_bl_s", 0.7, 4.0, about=ABOUT),
-            Limit("usual_bend_rad", most=math.radians(32.0), about=ABOUT),
+            (
+                Limit("speed_bl_s", 0.7, 4.0, about=ABOUT),
+                Limit("usual_bend_rad", most=math.radians(32.0), about=ABOUT),
+            ),
         ),
-        "j_turn": _defined(
+        "j_turn": Definition(
             "slow turn of up to {0} degrees by repeated one-sided bends far caudally, the front "
             "half straight",
-            Limit("either_turn_rad", most=math.radians(45.0), about=ABOUT),
+            (Limit("either_turn_rad", most=math.radians(45.0), about=ABOUT),),
         ),
-        "c_turn": _defined(
+        "c_turn": Definition(
             "C-bend of more than about {0} degrees in all within some 0.1 s, then a counter-bend "
             "and a burst",
-            Limit("bend_rad", least=math.radians(90.0), about=ABOUT),
+            (Limit("bend_rad", least=math.radians(90.0), about=ABOUT),),
         ),
-        "r_turn": _defined(
+        "r_turn": Definition(
             "routine turn by a single bend of about {0} to {1} degrees in all, without a strong "
             "counter-bend",
-            Limit("bend_rad", math.radians(45.0), math.radians(110.0), about=ABOUT),
+            (Limit("bend_rad", math.radians(45.0), math.radians(110.0), about=ABOUT),),
         ),
-        "surface": _defined(
+        "surface": Definition(
             "swims up, pitch above about {0} degrees",
-            Limit("pitch_rad", least=math.radians(15.0), about=ABOUT),
+            (Limit("pitch_rad", least=math.radians(15.0), about=ABOUT),),
         ),
-        "dive": _defined(
+        "dive": Definition(
             "swims down, pitch below about {0} degrees",
-            Limit("pitch_rad", most=math.radians(-15.0), about=ABOUT),
+            (Limit("pitch_rad", most=math.radians(-15.0), about=ABOUT),),
         ),
-        "zigzag": _defined(
+        "zigzag": Definition(
             "erratic: turns of {0} degrees and more that change side every 0.2 to 0.4 s, at "
             "raised speed",
-            Limit("swing_rad", least=math.radians(65.0)),
+            (Limit("swing_rad", least=math.radians(65.0)),),
         ),
-        "thrash": _defined(
+        "thrash": Definition(
             "large alternating bends of the whole body with little displacement",
-            Limit("moved_bl", most=1.0),
+            (Limit("moved_bl", most=1.0),),
         ),
-        "freeze": _defined(
+        "freeze": Definition(
             "below about {0} lengths/s without tail beats for {1} s or more",
-            Limit("quiet_bl_s", most=0.1, about=ABOUT),
-            Limit("duration_s", least=0.9),
+            (Limit("quiet_bl_s", most=0.1, about=ABOUT), Limit("duration_s", least=0.9)),
         ),
     },
     "mouse": {
-        "walk": _defined(
-            "goes at about {0} to {1} cm/s", Limit("speed_mm_s", 50.0, 300.0, about=ABOUT)
+        "walk": Definition(
+            "goes at about {0} to {1} cm/s", (Limit("speed_mm_s", 50.0, 300.0, about=ABOUT),)
         ),
-        "run": _defined(
-            "goes faster than about {0} cm/s", Limit("speed_mm_s", least=300.0, about=ABOUT)
+        "run": Definition(
+            "goes faster than about {0} cm/s", (Limit("speed_mm_s", least=300.0, about=ABOUT),)
         ),
-        "turn_left": _defined(
+        "turn_left": Definition(
             "turns by more than {0} degrees to its left, at up to {1} cm/s",
-            Limit("left_turn_rad", least=math.radians(30.0)),
-            Limit("speed_mm_s", most=150.0),
+            (Limit("left_turn_rad", least=math.radians(30.0)), Limit("speed_mm_s", most=150.0)),
         ),
-        "turn_right": _defined(
+        "turn_right": Definition(
             "turns by more than {0} degrees to its right, at up to {1} cm/s",
-            Limit("right_turn_rad", least=math.radians(30.0)),
-            Limit("speed_mm_s", most=150.0),
+            (Limit("right_turn_rad", least=math.radians(30.0)), Limit("speed_mm_s", most=150.0)),
         ),
-        "rear_supported": _defined(
+        "rear_supported": Definition(
             "nose raised far above the tail's base with a wall within about 5 cm before it; "
             "rising and descending belong to it",
-            _REARS,
+            (_REARS,),
         ),
-        "rear_unsupported": _defined(
+        "rear_unsupported": Definition(
             "nose raised far above the tail's base without a wall within about 5 cm before it; "
             "rising and descending belong to it",
-            _REARS,
+            (_REARS,),
         ),
-        "groom": _defined(
+        "groom": Definition(
             "sits hunched below {0} cm/s with rhythmic strokes of head and paws",
-            Limit("speed_mm_s", most=20.0),
+            (Limit("speed_mm_s", most=20.0),),
         ),
-        "pause": _defined("stays below {0} cm/s and looks about", Limit("speed_mm_s", most=50.0)),
-        "freeze": _defined(
+        "pause": Definition(
+            "stays below {0} cm/s and looks about", (Limit("speed_mm_s", most=50.0),)
+        ),
+        "freeze": Definition(
             "no movement of the body at all for {0} s or more",
-            Limit("duration_s", least=1.0),
-            Limit("speed_mm_s", most=20.0),
+            (Limit("duration_s", least=1.0), Limit("speed_mm_s", most=20.0)),
         ),
-        "sniff": _defined(
+        "sniff": Definition(
             "nose down to the floor with fast small movements of the head, below {0} cm/s",
-            Limit("speed_mm_s", most=100.0),
+            (Limit("speed_mm_s", most=100.0),),
         ),
-        "dart": _defined(
+        "dart": Definition(
             "a burst from standing to {0} cm/s or more and back within about {1} s",
-            Limit("peak_speed_mm_s", least=230.0),
-            Limit("duration_s", most=1.0, about=1.0 / 3.0),
+            (Limit("peak_speed_mm_s", least=230.0), Limit("duration_s", most=1.0, about=1.0 / 3.0)),
         ),
-        "stretch_attend": _defined(
-            "body long, low and straight, below {0} cm/s", Limit("speed_mm_s", most=50.0)
+        "stretch_attend": Definition(
+            "body long, low and straight, below {0} cm/s", (Limit("speed_mm_s", most=50.0),)
         ),
     },
 }

@@ -25,26 +25,6 @@ Array = NDArray[np.float64]
 
 _BLOCK = 16_384  # frames in memory at once
 CORRECTED = "corrected"  # flag of a pose with manually placed joints
-FLAGS = {
-    "": "a pose was measured and is trusted",
-    "doubtful": (
-        "a pose was measured, but its predicted error is large for this animal, or the image "
-        "contradicts it"
-    ),
-    "not_found": (
-        "the frame holds depth, but nothing in it resembles the animal; the row is NaN, or bridged"
-    ),
-    "hidden": (
-        "the animal is behind or under something, whole or so much of it that nobody knows how it "
-        "lies; the row is NaN"
-    ),
-    "corrected": "a person placed joints of this pose; the others follow as the bones allow",
-    "no_depth": "the frame holds no depth at all; the row is NaN, or bridged",
-    "repeated": (
-        "the depth image is a copy of the one before; the row is NaN where the stream froze, and "
-        "lies between its neighbours where each image was written more than once"
-    ),
-}
 
 
 @dataclass(frozen=True)
@@ -78,7 +58,7 @@ class Track(Rows):
         p_flip: (n,) probability that head and tail are exchanged.
         bridged: (n,) not measured, but interpolated between measurements shortly before and
             after.
-        flag: (n,) a word of `FLAGS`.
+        flag: (n,) a word of the column `flag` of the table `frames`.
     """
 
     skeleton: Skeleton
@@ -115,7 +95,7 @@ class Track(Rows):
         Args:
             skeleton: kinematic tree of the animal.
             times_ns: (n,) time stamps.
-            flag: word of `FLAGS` for all rows.
+            flag: for all rows.
             allocate: allocator of the columns.
 
         Returns:
