@@ -345,7 +345,7 @@ class BackgroundSubtraction(Segmenter):
             origin, step and n_px are in pixels of the full image.
         """
         if depths.shape[1:] != self.limit.shape:
-            depths = depths[:, :: self.stride, :: self.stride]
+            depths = np.ascontiguousarray(depths[:, :: self.stride, :: self.stride])
         self._check(depths)
         if self.level is not None:
             depths = self.level.brought_back(depths)
