@@ -111,8 +111,8 @@ def run_arenas(
             chosen = [*settings, *stated]
             own = plan.with_settings(stated) if plan else Plan.load(USUAL).with_settings(chosen)
             try:
-                seen = shared.masked(corners[one.name], lent=True)
-                fitted = fit_plan(seen, own, settings=(None if plan else chosen), progress=progress)
+                view = shared.masked(corners[one.name], lent=True)
+                fitted = fit_plan(view, own, settings=(None if plan else chosen), progress=progress)
                 prepared = prepare(fitted, folder, started, progress)
                 if pool is not None and isinstance(recording, str | Path):
                     prepared.measure_by(pool, recording, progress)

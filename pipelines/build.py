@@ -194,7 +194,7 @@ def stated_corners(recording: Recording, plan: Plan, region: sections.Region) ->
         plan: states the floor, or the animals that stand on it.
         region: the region.
     """
-    floor = None if region.unit == "px" else _floor_of_picture(recording, plan)
+    floor = None if region.unit == "px" else _floor_of_image(recording, plan)
     return region_corners_px(region, recording.camera, floor)
 
 
@@ -228,7 +228,7 @@ def region_of(recording: Recording, plan: Plan) -> NDArray[np.bool_] | None:
     return frame.region_mask(corners, recording.width, recording.height) if corners else None
 
 
-def _floor_of_picture(recording: Recording, plan: Plan) -> Floor:
+def _floor_of_image(recording: Recording, plan: Plan) -> Floor:
     """The floor that the plan states, or the one on which animals stand in the whole image."""
     stated = stated_floor(recording.camera, plan)
     if stated is not None:
@@ -309,8 +309,8 @@ def build_recording(
         RecordingError: the recording cannot be opened.
         PlanError: the plan's region lies outside the image.
     """
-    seen = rectify.rectified(open_planned(recording, plan, progress), build_water(plan))
-    return cut_out(rectify.mirrored(seen) if plan.recording.mirrored else seen, plan)
+    ideal = rectify.rectified(open_planned(recording, plan, progress), build_water(plan))
+    return cut_out(rectify.mirrored(ideal) if plan.recording.mirrored else ideal, plan)
 
 
 def open_planned(
@@ -413,7 +413,7 @@ def build_estimator(plan: Plan) -> PoseEstimator:
     if estimator.skeleton.name != wanted:
         raise PlanError(
             f"the model '{plan.estimation.model}' was made for the skeleton "
-            f"{estimator.skeleton.name}, but the plan says {plan.animal.skeleton}; set "
+            f"{estimator.skeleton.name}, but the plan names {plan.animal.skeleton}; set "
             f"estimation.model to a model of the {wanted}"
         )
     return estimator
@@ -562,7 +562,7 @@ def build_recogniser(plan: Plan, skeleton: Skeleton) -> timeline.TimelineModel |
     if model.skeleton != skeleton.name:
         raise PlanError(
             f"the action model '{name}' was made for the skeleton {model.skeleton}, but the plan "
-            f"says {skeleton.name}; set actions.model to another one, or to 'rules'"
+            f"names {skeleton.name}; set actions.model to another one, or to 'rules'"
         )
     return model
 

@@ -85,13 +85,13 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
     first.
     """
     first = try_plan(recording, plan or USUAL)
-    looks = [first]
+    fits = [first]
     if first.misfits:
         given = plan or Plan.load(USUAL)
-        looks += [try_plan(recording, name) for name in known_plans() if not _is(given, name)]
-    found = best(looks)
+        fits += [try_plan(recording, name) for name in known_plans() if not _is(given, name)]
+    found = best(fits)
     if found is None or found.fit is None:
-        summary = ". ".join(f"{one.name}: {', '.join(one.misfits)}" for one in looks)
+        summary = ". ".join(f"{one.name}: {', '.join(one.misfits)}" for one in fits)
         return Proposal(None, f"none fits. {summary}")
     fit = found.fit
     summary = (
@@ -213,9 +213,9 @@ def try_plan(recording: Recording, plan: Plan | str) -> PlanFit:
     return PlanFit(name, fit, misfits_of(fit, plan))
 
 
-def best(looks: Sequence[PlanFit]) -> PlanFit | None:
+def best(fits: Sequence[PlanFit]) -> PlanFit | None:
     """The plan that fits; of several, the one with the least error over its animal's length."""
-    fitting = [one for one in looks if one.fit is not None and not one.misfits]
+    fitting = [one for one in fits if one.fit is not None and not one.misfits]
     return min(fitting, key=_error_share, default=None)
 
 

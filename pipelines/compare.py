@@ -32,7 +32,7 @@ from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, evidence
 from liex_lab.sessions.folder import FAILED_FILE, read_failure
-from liex_lab.sessions.verdict import LOOK_AT_IT, OTHER_ANIMAL, Entry, read_verdict
+from liex_lab.sessions.verdict import NEEDS_REVIEW, OTHER_ANIMAL, Entry, read_verdict
 from liex_lab.tables.schema import dictionary, from_pandas, write_table
 
 from .study.status import misnamed
@@ -79,7 +79,7 @@ def compare_groups(
     entries, check = account(places)
     left = {one.key: one.state for one in entries if one.folder is None}  # and the reason
     if only_trusted:
-        left |= {one.key: "left out, look at it" for one in entries if one.state == LOOK_AT_IT}
+        left |= {one.key: "left out, needs review" for one in entries if one.state == NEEDS_REVIEW}
     sessions: dict[str, Session] = {}
     kept = sorted((one.folder, one.key) for one in entries if one.folder and one.key not in left)
     for folder, key in kept:
@@ -235,7 +235,7 @@ def _state_of(folder: Path, key: str, exclude: str = "") -> Entry:
     doubts = [one for one in verdict["cautions"] if str(one).startswith(OTHER_ANIMAL)]
     doubts += [] if verdict["accepted"] else verdict["reasons"]
     state = "has cautions" if verdict["cautions"] else "done"
-    state = LOOK_AT_IT if verdict["look_at_it"] else state
+    state = NEEDS_REVIEW if verdict["look_at_it"] else state
     return Entry(key, state, "; ".join(map(str, doubts)), folder=folder)
 
 

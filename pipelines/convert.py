@@ -140,8 +140,7 @@ def _writer(
     if _is_mcap(target):
         if step_mm is not None:
             raise RecordingError(
-                "an .mcap file keeps depth as it is, so that --step-mm (in Python step_mm=) says "
-                "nothing; leave it out"
+                "an .mcap file keeps depth as it is; leave out --step-mm (in Python step_mm=)"
             )
         metadata = {
             "source": recording.name,
@@ -382,18 +381,18 @@ def _region(
     if plan.arenas is not None:
         return None, ["whole images are kept, for the plan has several arenas in them"]
     try:
-        seen = build_recording(recording, plan, progress)
+        ideal = build_recording(recording, plan, progress)
     except LiexError as error:
         return None, [f"whole images are kept: {error}"]
-    with seen:
-        if seen.optics:
+    with ideal:
+        if ideal.optics:
             return None, ["whole images are kept, for lens, water or a mirror bend them"]
         progress(0, None, "finding the arena")
         try:
-            learned = build_tracker(seen, plan)
+            learned = build_tracker(ideal, plan)
         except (EstimationError, ModelError) as error:
             return None, [f"whole images are kept, for no arena was found: {error}"]
-        region = _found_region(learned, seen.width, seen.height)
+        region = _found_region(learned, ideal.width, ideal.height)
         if region is None:
             return None, [
                 "whole images are kept, for the measurement uses all of them, not only the arena; "
@@ -406,8 +405,8 @@ def _region(
             ]
         # margins that are tried around the found region, of the image's width
         for share in (0.0, 0.03, 0.1):
-            mask = _wider(region, round(share * seen.width))
-            cut = seen.viewed_by(seen.camera, _within(mask), {}, lent=True)
+            mask = _wider(region, round(share * ideal.width))
+            cut = ideal.viewed_by(ideal.camera, _within(mask), {}, lent=True)
             try:
                 if _alike(learned, build_tracker(cut, plan)):
                     return mask, []

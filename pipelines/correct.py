@@ -81,14 +81,14 @@ def correct_session(
         if log.touched and log.made_of != made_of and (what or undo):
             raise SessionError(
                 f"the corrections of {raw.path} were made on another measurement of this "
-                "recording; look at them with `liex correct list`, then apply them with `liex "
+                "recording; list them with `liex correct list`, then apply them with `liex "
                 f"correct apply`, or remove the folder {corrections.FOLDER}"
             )
         log = replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
         if not log.entries:
             raise SessionError(
-                f"{raw.path} has no corrections to apply; `liex correct --help` says how to make "
-                "one"
+                f"{raw.path} has no corrections to apply; `liex correct --help` explains how to "
+                "make one"
             )
         part = durable.unlinked(raw.path / f"{corrections.FOLDER}.part")
         shutil.rmtree(part, ignore_errors=True)
@@ -307,12 +307,12 @@ def _turned_round(
     agrees with its neighbour: there the smoothed curve was bent by the half turn that is gone. No
     row loses its pose or its trust.
     """
-    seen, subject = evidence.read_evidence(session)
+    observed, subject = evidence.read_evidence(session)
     rows_of_spans = (np.searchsorted(index, (one.start_frame, one.stop_frame)) for one in spans)
     wanted = [Flip(int(start), int(stop), 1.0, True, HUMAN) for start, stop in rows_of_spans]
     # from versions that wrote into the table
     earlier = [flip for flip in evidence.read_flips(session) if flip.source == HUMAN]
-    again = curve.track_whole(subject, seen, [*earlier, *wanted])
+    again = curve.track_whole(subject, observed, [*earlier, *wanted])
     ends = ends_of((flip.start, flip.stop) for flip in wanted)
     exchanged = np.cumsum(np.bincount(ends, minlength=len(index) + 1))[:-1] % 2 == 1
     near = exchanged.copy()

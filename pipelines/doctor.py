@@ -248,7 +248,7 @@ def examine(
             *filter(None, [timestamps.unwritable_times(opened.times_ns)]),
             *filter(None, () if missing else unusual),
             *_time_problems(opened),
-            *_copies_told(opened, sample),
+            *_repeated_images(opened, sample),
             *unlikely,
             *misplaced,
             *scene,
@@ -288,7 +288,7 @@ def _several(ideal: Recording, plan: Plan, misplaced: list[str]) -> list[section
     return found
 
 
-def _copies_told(recording: Recording, sample: NDArray[np.float32]) -> list[str]:
+def _repeated_images(recording: Recording, sample: NDArray[np.float32]) -> list[str]:
     """Sentences on frames that repeat the depth image before them.
 
     A long recording is compared in windows spread over it.
@@ -569,7 +569,7 @@ def _water_depth(water: camera.Water, floor: Floor, distance_mm: float) -> tuple
     return deep, [
         f"the floor is tilted by {math.degrees(angle):.1f} degrees against the water's surface; if "
         f"the tank's floor is level, the camera is tilted: set water.tilt_x_rad={tilts[0]:.3f} and "
-        f"water.tilt_y_rad={tilts[1]:.3f}, and look again"
+        f"water.tilt_y_rad={tilts[1]:.3f}, and run `liex doctor` again"
     ]
 
 

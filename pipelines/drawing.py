@@ -60,8 +60,8 @@ def draw_figures(
         drawn = comparison_figures(path, only)
     else:
         sets.check_names(only, list(sets.OF_STUDY))
-        _, look = list_sessions(path)
-        folders = [entry.folder for entry in look() if entry.folder is not None]
+        _, entries = list_sessions(path)
+        folders = [entry.folder for entry in entries() if entry.folder is not None]
         if not folders:
             raise SessionError(
                 f"no session of {path} has been measured; `liex cohort` measures them"
@@ -72,7 +72,7 @@ def draw_figures(
     if not files:
         raise SessionError(
             f"{path} holds nothing to draw of {', '.join(empty)}: no pose was found, or too few "
-            "actions; its report says why"
+            "actions; its report states why"
         )
     return {"files": files, "empty": empty, "folder": target}
 
@@ -135,7 +135,7 @@ def export_video(
     path = video_path(folder, alone.name if len(chosen) == 1 else "sessions", what)
     if path.exists() and not overwrite:
         raise SessionError(
-            f"{path} exists already; name another place with --out, or say --overwrite (in Python "
+            f"{path} exists already; name another place with --out, or use --overwrite (in Python "
             "out= and overwrite=True)"
         )
     if len(chosen) == 1 and not actions:

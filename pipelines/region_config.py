@@ -157,7 +157,7 @@ class StatedRegions:
         path = Path(place)
         self._study = path if path.is_file() or (path / STUDY_FILE).is_file() else None
         self._lock = threading.Lock()
-        self._seen: dict[str, tuple[NDArray[np.uint16], Camera]] = {}
+        self._usual: dict[str, tuple[NDArray[np.uint16], Camera]] = {}
 
     @property
     def of_recordings(self) -> bool:
@@ -173,19 +173,19 @@ class StatedRegions:
 
         Returns:
             places (name, title, file, stated), place (the name of the one that applies), region
-            (corners, px; None if none is stated), said (why it cannot be displayed), recording (its
-            name in commands), has_recording (whether its whole image is available).
+            (corners, px; None if none is stated), message (why it cannot be displayed), recording
+            (its name in commands), has_recording (whether its whole image is available).
 
         Raises:
             LiexError: there is no such recording, or the study cannot be read.
         """
         places = self._places(key, session)
         counts = next((one for one in reversed(places) if one.stated is not None), places[0])
-        corners, said = None, ""
+        corners, message = None, ""
         try:
             corners = self._shown(counts, session)
         except LiexError as error:
-            said = str(error)
+            message = str(error)
         return {
             "places": [
                 {"name": one.name, "title": one.title, "file": one.file.name, "stated": one.stated}
@@ -193,7 +193,7 @@ class StatedRegions:
             ],
             "place": counts.name,
             "region": corners,
-            "message": said,
+            "message": message,
             "recording": self._recording(key, session),
             "has_recording": self._study is not None and self._planned(key)[1].recording_exists,
         }
@@ -247,7 +247,7 @@ class StatedRegions:
             command = f"liex cohort {shlex.quote(str(self._study))}"
         return f"{found.file.name} {done}; measure again: {command}"
 
-    def picture(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
+    def depth_image(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         """The usual depth of every pixel of a study's recording, in the whole image.
 
         Returns:
@@ -257,18 +257,18 @@ class StatedRegions:
             LiexError: the recording is not in a study, or cannot be read.
         """
         with self._lock:
-            return self._seen_whole(key)
+            return self._usual_depth(key)
 
-    def _seen_whole(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
+    def _usual_depth(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
 
         planned = self._planned(key)[1]
-        if key not in self._seen:
+        if key not in self._usual:
             whole = planned.plan.with_settings(["arena.region="])
             with build_recording(planned.recording, whole) as opened:
                 # number of sampled frames for each pixel's usual depth
                 sample = np.clip(np.rint(sample_frames(opened, 9)), 0, 65_535)
-                self._seen = {key: (usual_depth(sample.astype(np.uint16)), opened.camera)}
-        return self._seen[key]
+                self._usual = {key: (usual_depth(sample.astype(np.uint16)), opened.camera)}
+        return self._usual[key]
 
     def _planned(self, key: str) -> tuple[int, PlannedSession, Study]:
         if self._study is None:
@@ -318,7 +318,7 @@ class StatedRegions:
         if not isinstance(corners, list) or len(corners) > _MOST_CORNERS:
             raise PlanError(f"a region is a list of at most {_MOST_CORNERS} corners [x, y]")
         region = _region(corners)
-        camera = self._seen_whole(key)[1] if session is None else session.camera
+        camera = self._usual_depth(key)[1] if session is None else session.camera
         # raises an error if it is not valid
         region_mask(region_corners_px(region), camera.width, camera.height)
         return [[round(float(value), 1) for value in corner] for corner in region.polygon or ()]

@@ -69,7 +69,7 @@ def _card(path: Path, mouse: recording.SyntheticSession) -> str:
     """The sample's card, TOML."""
     facts = {
         "what": (
-            "a virtual mouse that walks, turns and rears in a round arena, seen from above by an "
+            "a virtual mouse that walks, turns and rears in a round arena, viewed from above by an "
             "imitated PrimeSense camera of 320 x 240 pixels; 16-bit depth in mm, the camera's "
             "calibration and its place above the floor as Foxglove protobuf messages"
         ),

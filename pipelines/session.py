@@ -568,7 +568,7 @@ def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Se
     """Measure the behaviour and move the session to its folder; returns the finished session."""
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes, problems=_refused_sentence(notes))
-    memory.rest()
+    memory.release_memory()
     return writer.close(timings_s=timings, **behaviour.for_session())
 
 
@@ -599,7 +599,7 @@ def measure_behaviour(
     elif nameless := why_nameless(plan, origin.skeleton):
         named = {"bouts": empty_table(BOUTS), "actions": {}}
         notes = {"no_actions": nameless}
-    memory.rest()
+    memory.release_memory()
     return summary.measure_rows(rows, rules, around, moved=moved, allocate=allocate, **named), notes
 
 

@@ -20,23 +20,54 @@ COUNTED = (
     "CONTRIBUTING.md",
 )
 ENDINGS = {".py", ".md", ".toml", ".html", ".j2", ".mjs", ".js"}
+KEPT = (  # not counted
+    # keys and files of sessions, studies and results, and a key of the browser's storage: they stay
+    # readable
+    "look_at_it",
+    "look.json",
+    "whole_picture",
+    '"picture"',
+    "`picture`",
+    "seen_share",
+    '_OBSERVED = "seen"',
+    "-seen-",
+    "plan_says",
+    '"said"',
+    " said: ",
+    '"told"',
+    "liex-looked-",
+    "cutout {k + 1} in the picture",
+    # stored in models
+    "tells_facing",
+    "and looks about",
+    "no picture of a hand was used",
+    # Python's file method, Rerun's argument, and words in the users' file names
+    ".tell()",
+    "look_target",
+    "|pictures?|",
+    # former spellings in CHANGELOG.md
+    "`look at it`",
+    "`--pictures`",
+    "`told=`",
+    "`say=`",
+)
 LIMITS = {
-    "pictures?": 37,
-    "told": 17,
-    "tells?": 18,
-    "seen": 62,
-    "said": 14,
-    "says?": 115,
-    "whom?": 33,
-    "looks?": 130,
-    "looked": 7,
-    "anew": 4,
-    "things?": 1,
+    "pictures?": 0,
+    "told": 0,
+    "tells?": 0,
+    "seen": 0,
+    "said": 0,
+    "says?": 0,
+    "whom?": 0,
+    "looks?": 0,
+    "looked": 0,
+    "anew": 0,
+    "things?": 0,
     "put right": 0,
-    "bear out": 1,
+    "bear out": 0,
     "by far": 0,
-    "wants": 1,
-    "is none": 58,
+    "wants": 0,
+    "is none": 0,
     "Wanted": 0,
     "Listed": 0,
     "put_in": 0,
@@ -57,6 +88,8 @@ def count_words() -> dict[str, int]:
     )
     paths = [REPOSITORY / name for name in listed.stdout.split("\n") if name]
     text = "\n".join(path.read_text(encoding="utf-8") for path in paths if path.suffix in ENDINGS)
+    for name in KEPT:
+        text = text.replace(name, "")
     return {word: len(re.findall(rf"(?<![A-Za-z]){word}(?![A-Za-z])", text)) for word in LIMITS}
 
 

@@ -129,7 +129,7 @@ class Scenes:
     def _whole(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         if self._regions is None:
             raise SessionError(f"{key} was not measured yet, so there is no image of it")
-        return self._regions.picture(key)
+        return self._regions.depth_image(key)
 
 
 def scene_svg(session: Session, depth: NDArray[np.uint16]) -> str:
@@ -196,7 +196,7 @@ def make_app(
         regions: reads and writes the regions of recordings: `of_recordings`, whether recordings
             without results are available; `about(key, session)`, facts about a region;
             `save(key, session, place, corners, was)`, which saves corners (px) in a place that
-            contained `was`; and `picture(key)`, the usual depth (mm) of every pixel, and the
+            contained `was`; and `depth_image(key)`, the usual depth (mm) of every pixel, and the
             camera. None writes none.
     """
     app = Flask(
@@ -427,7 +427,7 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
         where = printable(request.path)[:200]
         print(f"dashboard: {where} could not be answered ({cause})", file=sys.stderr)
         return Response(
-            "This request cannot be answered; load the page again. The terminal says why.",
+            "This request cannot be answered; load the page again. The terminal shows the error.",
             500,
             mimetype="text/plain",
         )

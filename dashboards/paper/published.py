@@ -65,8 +65,8 @@ DEVIATIONS = (
     "Trainings: three of the paper's variant and its ablations; one of ours, of RF and of CNN, so "
     "nothing shows how much of their numbers is the luck of one training.",
     "Clean, hard and other-body are no untouched tests of ours: they were inspected while it was "
-    "made, and choices were made by what they showed, such as the network that tells head from "
-    "tail by other-body. The sealed split was not inspected.",
+    "made, and choices were made by what they showed, such as the head-tail classifier by "
+    "other-body. The sealed split was not inspected.",
     "Leaves hold 5 examples at most, rounds C, trees, depths and initial poses Kt are as in the "
     "paper; a node has 20 thresholds, a tree sees 63 % of the images, and the mean shift goes in "
     "four steps from the mean vote, with a bandwidth of 10 mm of a mouse; all of this the paper "
@@ -75,9 +75,9 @@ DEVIATIONS = (
     "Without multiple initial poses: 5 draws of each of the 3 models.",
     "Offsets of the features are projected to first order, and reach 0.3 times as far in depth as "
     "across.",
-    "Which of two objects is the animal, and how large it is, our default model says for all rows; "
-    "the paper has one object in an image and skeletons of 'proper scaling'. RF and CNN are told "
-    "no size, as in the paper.",
+    "Our default model selects one of two objects as the animal and estimates its size, for all "
+    "rows; the paper has one object in an image and skeletons of 'proper scaling'. RF and CNN do "
+    "not know the size, as in the paper.",
     "RF: how its forests vote, and that F2 learns where F1 took no tail for a head, is chosen "
     "here.",
     "CNN: AlexNet's shape at half its width, hidden layers of 1,024 instead of 4,096, batch "

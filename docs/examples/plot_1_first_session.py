@@ -21,7 +21,7 @@ session = liex_lab.Session.open(folder)
 session
 
 # %%
-# The first thing to read is how it went. The same sentence ends ``liex run`` and opens the report.
+# Read the verdict first. The same sentence ends ``liex run`` and opens the report.
 print(session.metadata["verdict"]["sentence"])
 
 # %%

@@ -51,6 +51,6 @@ print(f"mean joint error {np.nanmean(error):.1f} mm")
 print(f"expected         {session.metadata['verdict']['expected_error_mm']:.1f} mm")
 
 # %%
-# What it means for you: an interval is about the joint's place in this frame. It is not about the
-# animal's behaviour, and not about your group. It knows the errors that the training pictures had;
-# on a build or fur that was not among them it is too narrow (docs/concepts/how-it-fails.md).
+# An interval describes the position of a joint in one frame, not the animal's behaviour or your
+# group. It is calibrated on the errors in the training images; for a build or fur that was not
+# among them it is too narrow (docs/concepts/how-it-fails.md).

@@ -34,14 +34,13 @@ for scene in ("plain", "bedding", "two-animals"):
     rows[scene] = (np.min(each, axis=0), session)  # of the animal that was followed
 
 # %%
-# What the program itself says of each:
+# The verdict on each session:
 for scene, (_, session) in rows.items():
     print(f"{scene}: {session.metadata['verdict']['sentence']}")
 
 # %%
-# And what is true. Orange is the error of each frame, blue what the program expected of it. Where
-# orange lies above blue, the program does not know how wrong it is. This mouse is of a build that
-# the models have not seen.
+# The true errors: orange is the error of each frame, blue the expected error. Where orange lies
+# above blue, the error is underestimated. The build of this mouse is not in the training data.
 figure, axes = plt.subplots(1, len(rows), figsize=(9, 3), sharey=True, layout="constrained")
 for axis, (scene, (error, session)) in zip(np.atleast_1d(axes), rows.items(), strict=True):
     frames = session.frames

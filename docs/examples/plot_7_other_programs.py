@@ -22,7 +22,7 @@ session = liex_lab.Session.open(folder)
 place = Path(tempfile.mkdtemp())
 
 # %%
-# ``nwb`` wants the time of day at which the recording began, which the sample does not have:
+# ``nwb`` needs the time of day at which the recording began, which the sample does not have:
 # ``liex describe SESSION session_start_time=2026-08-21T10:00:00+02:00`` states it.
 for to in ("csv", "xlsx", "dlc", "movement", "sleap", "boris"):
     path = export(session, to, place)

@@ -96,7 +96,7 @@ def find_units(
     nameless = int((rows["subject_id"] == "").sum())
     _require(
         nameless == 0,
-        f"{nameless} sessions do not say which animal they are of; state subject_id in the study",
+        f"{nameless} sessions have no subject_id; state it in the study",
     )
     of_animal = rows.groupby("subject_id")["group"].nunique()
     both = [str(name) for name in of_animal.index[of_animal > 1]]

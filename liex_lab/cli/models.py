@@ -410,10 +410,10 @@ def evaluate_scenes(
         bool,
         typer.Option("--sealed", help="Use the held-out split; not for development."),
     ] = False,
-    pictures: Annotated[
+    figures: Annotated[
         Path | None,
         typer.Option(
-            "--pictures", metavar="DIR", help="Draw frames of each scene into this folder."
+            "--figures", metavar="DIR", help="Draw frames of each scene into this folder."
         ),
     ] = None,
     *,
@@ -425,7 +425,7 @@ def evaluate_scenes(
         n_frames=n_frames,
         n_recordings=n_recordings,
         sealed=sealed,
-        pictures=pictures,
+        figures=figures,
         progress=progress,
     )
 

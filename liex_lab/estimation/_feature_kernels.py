@@ -380,23 +380,23 @@ def back_over(heights, packed_camera, position, most, out):
     u, v = to_pixel(crop_camera(packed_camera), position[0], position[1], position[2])
     column = int(np.floor(u + 0.5))
     row = int(np.floor(v + 0.5))
-    seen = np.empty((2 * _WINDOW + 1) ** 2)
+    readings = np.empty((2 * _WINDOW + 1) ** 2)
     n = 0
     for r in range(max(row - _WINDOW, 0), min(row + _WINDOW, last) + 1):
         for c in range(max(column - _WINDOW, 0), min(column + _WINDOW, last) + 1):
             if heights[r, c] > 0:
-                seen[n] = heights[r, c] / 16.0 - position[2]
+                readings[n] = heights[r, c] / 16.0 - position[2]
                 n += 1
     out[0] = 0.0
-    out[1] = n / seen.size
+    out[1] = n / readings.size
     if n == 0:
         return
-    middle = np.sort(seen[:n])[n // 2]
+    middle = np.sort(readings[:n])[n // 2]
     total = 0.0
     many = 0
     for i in range(n):
-        if abs(seen[i] - middle) <= most:
-            total += seen[i]
+        if abs(readings[i] - middle) <= most:
+            total += readings[i]
             many += 1
     out[0] = total / many
 
@@ -517,7 +517,7 @@ def lay_along(heights, crop_cameras, rump, tip, middle, size, along, across, out
 
 
 @kernel(nogil=True)
-def read_across(heights, crop_cameras, points, sideways, lateral, seen, height, start, stop):
+def read_across(heights, crop_cameras, points, sideways, lateral, covered, height, start, stop):
     """Read height maps at distances to the left and right of points on the mid-axis.
 
     Args:
@@ -526,7 +526,7 @@ def read_across(heights, crop_cameras, points, sideways, lateral, seen, height, 
         points: (n, S, 3) on the mid-axis, mm, view frame.
         sideways: (n, S, 2) unit vectors across the axis, view frame.
         lateral: (T,) distances from the axis, mm.
-        seen: (n, S, T) filled with the share of the two sides that shows the animal, 0 to 1.
+        covered: (n, S, T) filled with the share of the two sides that shows the animal, 0 to 1.
         height: (n, S, T) filled with the mean height of those over the axis, mm, 0 without any.
         start: first item to process, see `in_parallel`.
         stop: the item after the last.
@@ -550,5 +550,5 @@ def read_across(heights, crop_cameras, points, sideways, lateral, seen, height, 
                     if inside and heights[i, row, column] > 0:
                         n += 1
                         total += heights[i, row, column] / 16.0 - points[i, s, 2]
-                seen[i, s, t] = 0.5 * n
+                covered[i, s, t] = 0.5 * n
                 height[i, s, t] = total / n if n > 0 else 0.0

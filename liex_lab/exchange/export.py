@@ -111,7 +111,7 @@ def export(
     path = durable.inside(folder, session.name, ending)
     if path.exists() and not overwrite:
         raise SessionError(
-            f"{path} exists already; name another place (--out, in Python out=), or say "
+            f"{path} exists already; name another place (--out, in Python out=), or use "
             "--overwrite (in Python overwrite=True)"
         )
     try:

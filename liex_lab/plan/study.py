@@ -360,7 +360,7 @@ class Study:
         if table.get("arenas") is not None:
             raise StudyError(
                 f"{self.path}, session {id}: a session of a study is of one animal in one arena; "
-                'list [[arenas]] with name and region in the study and say arena = "NAME" in each '
+                'list [[arenas]] with name and region in the study and set arena = "NAME" in each '
                 "of [[sessions]]"
             )
         try:
@@ -501,7 +501,7 @@ def find_subject(path: Path, stated: str = "", root: Path | None = None) -> Subj
         path: the recording.
         stated: the animal's name in the recording's metadata; may be empty.
         root: folder from which names count. None: from `rawdata` or a study file's folder on, or
-            without either, folders that look like an animal's tag, such as m01.
+            without either, folders named like an animal's tag, such as m01.
     """
     whole = path.absolute()
     studies = (one for one in whole.parents if one.name == RAW or (one / STUDY_FILE).is_file())
@@ -538,7 +538,7 @@ def _session(names: Sequence[str], animal: str) -> str:
 
 
 def _tags_above(whole: Path) -> list[str]:
-    """Names of the folders above a recording, up to one that looks like an animal's tag."""
+    """Names of the folders above a recording, up to one named like an animal's tag."""
     names = [folder.name for folder in whole.parents]
     bids = [k for k, name in enumerate(names) if name.lower().startswith("sub-")]
     n = next((k for k, name in enumerate(names) if animal_part(name)), 0)

@@ -2,7 +2,7 @@
 
 *Rectification* (table lookup, forward splatting with a z-buffer, hole closing) is serial and
 releases the GIL: the output is scattered over the image, and two threads in parallel cost more than
-they save (`look_up` of 1024 x 1024 pixels takes about 2 ms, `lift` and `close` 6 ms).
+they save (`gather` of 1024 x 1024 pixels takes about 2 ms, `lift` and `close` 6 ms).
 
 *RVL* (Wilson, ISS 2017): pairs of counts (unread pixels, read pixels), followed by the read pixels
 as steps s from the previous one, zigzag coded, z = (s << 1) ^ (s >> 63). Every number is written in
@@ -36,7 +36,7 @@ _FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn", "reassoc"}
 
 
 @kernel(nogil=True)
-def look_up(depth, source, out):
+def gather(depth, source, out):
     """For every pixel of the rectified image, copy the depth of one pixel of the original image.
 
     Args:
@@ -336,7 +336,7 @@ _WIDE = 0xFF
 
 @kernel(nogil=True)
 def _oni_kernels_unpack(stream, table, out):
-    """Decode a stream of numbers, and look up the depth of each in a table.
+    """Decode a stream of numbers, and map each to its depth by a table.
 
     Args:
         stream: (m,) uint8.

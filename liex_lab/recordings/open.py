@@ -45,12 +45,12 @@ _NOT_READ = {
     **dict.fromkeys(
         (".ply", ".xyz"),
         "is a point cloud, which is read as one of a folder; write a raytrix.toml beside it that "
-        'says what its numbers mean, with a line such as profile = "raytrix-points-mm", and give '
+        'defines its numbers, with a line such as profile = "raytrix-points-mm", and give '
         "the folder",
     ),
     **dict.fromkeys(
         (".jpg", ".jpeg", ".bmp", ".gif", ".webp", ".mp4", ".mov", ".webm"),
-        "is an 8-bit image or a video for people to look at, and 16-bit depth was expected; give "
+        "is an 8-bit image or a video for display, and 16-bit depth was expected; give "
         "the depth itself",
     ),
     **dict.fromkeys(
@@ -214,7 +214,7 @@ def _reader_of_folder(folder: Path) -> tuple[tuple[str, str], Path]:
         return ("images.nyu", "open_nyu"), folder
     if "session.json" in inside:
         raise RecordingError(
-            f"{folder} is a session, the result of a run; look at it with `liex show`, or give a "
+            f"{folder} is a session, the result of a run; open it with `liex show`, or give a "
             "recording"
         )
     if any(Path(name).suffix.lower() in (*_IMAGES, ".jpg", ".jpeg", ".bmp") for name in inside):

@@ -59,8 +59,8 @@ def rectified(recording: Recording, water: Water | None = None) -> Recording:
 def mirrored(recording: Recording, *, lent: bool = False) -> Recording:
     """The recording with left and right exchanged in every image.
 
-    Drivers of some cameras deliver mirrored images. A mirrored image of a left hand cannot be told
-    from an image of a right hand, so this also serves to measure left hands.
+    Drivers of some cameras deliver mirrored images. A mirrored image of a left hand cannot be
+    distinguished from one of a right hand, so this also serves to measure left hands.
 
     Args:
         recording: rectified depth: a distortion would not be mirrored.
@@ -142,7 +142,7 @@ def rectifier(camera: Camera, water: Water | None = None) -> Callable[[Depth], D
         """Rectify depth (H, W) float32 mm, 0 where unread; returns (H', W') float32 mm."""
         if source is not None:
             straight = np.empty(source.shape, np.float32)
-            kernels.look_up(depth, source, straight)
+            kernels.gather(depth, source, straight)
             depth = straight
         if laws is not None:
             lifted = np.empty_like(depth)

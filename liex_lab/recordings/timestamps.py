@@ -218,7 +218,7 @@ def clock_doubts(step_ns: int, faults: NDArray[np.uint8]) -> tuple[str, ...]:
     if step_ns > 0 and not PLAUSIBLE_HZ[0] <= hz <= PLAUSIBLE_HZ[1]:
         found.append(
             f"by its time stamps the camera made {hz:,.{0 if hz > 10 else 3}f} frames/s: they are "
-            "in another unit than it says, and speeds and durations are wrong by that"
+            "in another unit than stated, and speeds and durations are wrong by that"
         )
     n_moved = int(np.isin(faults, (_REPEATED, _OUT_OF_ORDER)).sum())
     # most stamps repeated or out of order, as on a busy computer
@@ -520,8 +520,8 @@ def unpaired(frames_from: str, times_from: str) -> str:
         times_from: name of the file of the stamps.
     """
     return (
-        f"{frames_from} and {times_from} do not hold equally many frames and nothing says which "
-        "are missing: times may be wrong by these"
+        f"{frames_from} and {times_from} do not hold equally many frames, and the missing "
+        "ones are unknown: times may be wrong by these"
     )
 
 

@@ -51,7 +51,7 @@ def peak_memory_mb() -> float | None:
     return float(peak) / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def rest() -> None:
+def release_memory() -> None:
     """Return unused memory to the system: pages of arrays on disk, and free heap.
 
     Otherwise glibc keeps the gaps between arrays in use, and Arrow keeps the memory of tables;
@@ -157,7 +157,7 @@ def blocks(n: int, size: int) -> Iterator[slice]:
         yield slice(start, min(start + size, n))
         _release_pages()
     if n > size:
-        rest()
+        release_memory()
 
 
 # Size limits of a NumPy archive (.npz) of unknown origin, checked before it is unpacked.

@@ -118,8 +118,8 @@ class Floor:
             ),
             (
                 self.tilt_rad > math.radians(15.0),
-                f"the camera looks down at {math.degrees(self.tilt_rad):.0f} degrees from "
-                "straight, and poses are learned up to 10; turn it to look straight down",
+                f"the camera is tilted by {math.degrees(self.tilt_rad):.0f} degrees from the "
+                "vertical, and poses are learned up to 10; point it straight down",
             ),
         )
         return [sentence for differs, sentence in differences if differs]
@@ -183,7 +183,7 @@ def find_floor(background: NDArray[np.float32], camera: Camera, seed: int = 0) -
     if share < 0.2 or tilt > _MAX_TILT_DEG:
         raise EstimationError(
             f"no floor was found: the largest plane contains {share:.0%} of the readable pixels "
-            f"and is tilted by {tilt:.0f} degrees; the camera should look down on a floor"
+            f"and is tilted by {tilt:.0f} degrees; the camera should point down at a floor"
         )
     return floor
 

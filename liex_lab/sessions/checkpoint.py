@@ -30,7 +30,7 @@ from liex_lab.runtime import durable, memory
 EVERY_S = 3.0
 _STATE = "checkpoint.json"
 _LOCK = "lock"
-_SEEN = "seen"
+_OBSERVED = "seen"
 STRETCHES = "stretches"
 # of work: 300 years; also excludes integers too large for a float
 _MOST_S = 1e10
@@ -41,7 +41,7 @@ _KINDS = TypeAdapter(
         tuple[str, list[Annotated[int, Field(ge=0, lt=1 << 20)]]],
     ]
 )
-OWN = (_STATE, _LOCK, _SEEN, STRETCHES, "resumed.rrd")  # not in the finished session
+OWN = (_STATE, _LOCK, _OBSERVED, STRETCHES, "resumed.rrd")  # not in the finished session
 
 
 LOGS = ("session.rrd", "session.mcap")
@@ -113,8 +113,8 @@ class Checkpoint:
         self.state = state
         self.seconds_before = state.seconds
         self.n_interruptions = state.interruptions
-        (folder / _SEEN).mkdir(exist_ok=True)
-        self.columns = Columns(folder / _SEEN)
+        (folder / _OBSERVED).mkdir(exist_ok=True)
+        self.columns = Columns(folder / _OBSERVED)
         self._last = time.monotonic()
         replay, resumed = folder / LOGS[0], folder / _RESUMED
         if resumed.is_file():
@@ -168,7 +168,7 @@ class Checkpoint:
         """Save a state once its files are on disk, so that it survives a power cut."""
         self.columns.flush()
         state = self.state.model_copy(update=changes)
-        durable.sync_tree(self.folder / _SEEN)
+        durable.sync_tree(self.folder / _OBSERVED)
         for log in state.logs:
             durable.sync_file(self.folder / log)
         durable.write_whole(self.folder / _STATE, state.model_dump_json())
@@ -212,7 +212,7 @@ class Checkpoint:
             if _size(self.folder / log) < size:
                 return False
             os.truncate(self.folder / log, size)
-        return Columns.cut(self.folder / _SEEN, state.n_frames)
+        return Columns.cut(self.folder / _OBSERVED, state.n_frames)
 
     def _empty(self) -> None:
         for path in self.folder.iterdir():

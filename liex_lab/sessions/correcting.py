@@ -591,7 +591,7 @@ def descriptions(facts: Mapping[str, str]) -> list[Correction]:
             near = difflib.get_close_matches(key, DESCRIBED, 1, 0.4)
             raise SessionError(
                 f"a session is not described by {key!r}"
-                + (f"; did you mean {near[0]}?" if near else f"; say {', '.join(DESCRIBED)}")
+                + (f"; did you mean {near[0]}?" if near else f"; use {', '.join(DESCRIBED)}")
             )
     stated = {key: value for key, value in facts.items() if value}
     checked = Plan.from_table({"session": stated}).session.model_dump()

@@ -161,7 +161,7 @@ def check_writable(path: Path, overwrite: bool) -> None:
         (
             not overwrite,
             f"the session {path} exists already; choose another place (--out, in Python out=), or "
-            "say --overwrite (in Python overwrite=True)",
+            "use --overwrite (in Python overwrite=True)",
         ),
     )
 

@@ -303,7 +303,7 @@ class Session:
                 read = file.read(known, use_threads=False)
                 table = read.to_pandas(split_blocks=True, self_destruct=True, use_threads=False)
                 del read
-                memory.rest()
+                memory.release_memory()
                 check_rows(name, table, self.metadata["animal"]["joints"])
                 other.__dict__[name] = table
         return other
@@ -412,7 +412,7 @@ def _rows_of(path: Path, columns: list[str] | None, frame_index: list[int]) -> p
         for k in range(file.num_row_groups):
             group = file.read_row_group(k, wanted, use_threads=False).to_pandas()
             found.append(group[group["frame_index"].isin(frame_index)])
-    memory.rest()
+    memory.release_memory()
     rows = pd.concat(found, ignore_index=True)
     return rows if columns is None else rows[columns]
 

@@ -17,7 +17,7 @@ from liex_lab.runtime.text_files import loose_json
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Track
 
-LOOK_AT_IT = "look at it"
+NEEDS_REVIEW = "needs review"
 CAUTION = "note"
 OTHER_ANIMAL = "the recording names another animal"  # start of that caution
 
@@ -114,7 +114,7 @@ class Verdict:
         )
 
     @property
-    def look_at_it(self) -> bool:
+    def needs_review(self) -> bool:
         """Whether the session needs review before it is used."""
         return bool(self.reasons)
 
@@ -130,7 +130,7 @@ class Verdict:
             parts[0] += f", expected error {self.expected_error_mm:.1f} mm"
         if self.reasons:
             accepted = " (accepted)" if self.accepted else ""
-            parts.append(f"{LOOK_AT_IT}{accepted}: {'; '.join(self.reasons)}")
+            parts.append(f"{NEEDS_REVIEW}{accepted}: {'; '.join(self.reasons)}")
         if self.cautions:
             parts.append(f"{CAUTION}: {'; '.join(self.cautions)}")
         return ". ".join(parts)
@@ -141,7 +141,7 @@ class Verdict:
             **asdict(self),
             "reasons": list(self.reasons),
             "cautions": list(self.cautions),
-            "look_at_it": self.look_at_it,
+            "look_at_it": self.needs_review,
             "sentence": self.sentence,
         }
 
@@ -209,6 +209,6 @@ def state_in_words(state: str, reason: str) -> str:
         state: done, failed, new, begun, changed or excluded.
         reason: why it is in this state, or why it needs review although it is done.
     """
-    if state == "done" and reason.startswith(LOOK_AT_IT):
-        return f"done, {LOOK_AT_IT}"
+    if state == "done" and reason.startswith(NEEDS_REVIEW):
+        return f"done, {NEEDS_REVIEW}"
     return "done with cautions" if state == "done" and reason.startswith(CAUTION) else state

@@ -286,7 +286,7 @@ class SessionWriter:
         """
         self.track = tracked.track
         self._flips = tracked.flips
-        memory.rest()  # much memory after a long recording
+        memory.release_memory()  # much memory after a long recording
         self._candidates = observations if self.origin.replay_candidates else None
         self._together = observations if subject.n_animals > 1 else None
         write_evidence(self._folder, observations, subject)
@@ -362,7 +362,7 @@ class SessionWriter:
         of_track = Results(self.origin, rows, self._flips)
         of_track.write_track(self._folder)
         of_track.write_measured(self._folder, results, columns)
-        memory.rest()
+        memory.release_memory()
         named = sorted({str(word) for word in bouts["action"]}.difference(actions or {}))
         actions = {**(actions or {}), **dict.fromkeys(named, "")}
         words = [*actions]
@@ -405,7 +405,7 @@ class SessionWriter:
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
         del rows, of_track
         self._rows = None  # the report reads the folder
-        memory.rest()
+        memory.release_memory()
         self._publish_with_report()
         return Session.open(self.path)
 
@@ -523,7 +523,7 @@ def _check_times(times_ns: NDArray[np.int64], track: Track) -> None:
 
 
 _SIZES = "stretch.json"
-_SEEN = "seen"
+_OBSERVED = "seen"
 
 
 def shard_folder(unfinished: Path, start: int, stop: int) -> Path:
@@ -559,7 +559,7 @@ def append_shard(held: Checkpoint, folder: Path, n_frames: int, seconds: float) 
         n_frames: frames of the session including the shard.
         seconds: time spent on them, s.
     """
-    held.columns.append(Columns(folder / _SEEN).read())
+    held.columns.append(Columns(folder / _OBSERVED).read())
     held.append(folder, n_frames, seconds)
     shutil.rmtree(folder, ignore_errors=True)
 
@@ -582,8 +582,8 @@ def shard_writer(
 
     part = folder.with_name(f".{folder.name}.{os.getpid()}")
     shutil.rmtree(part, ignore_errors=True)
-    (part / _SEEN).mkdir(parents=True)
-    columns = Columns(part / _SEEN)
+    (part / _OBSERVED).mkdir(parents=True)
+    columns = Columns(part / _OBSERVED)
     replay = rrd.ReplayWriter(part / LOGS[0], origin)
     messages = mcap.McapWriter(part / LOGS[1], origin)
     keeper = DepthKeeper(origin)

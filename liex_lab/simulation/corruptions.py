@@ -4,7 +4,7 @@ A script deals shuffled decks of the events in `EVENTS`, so that each kind recur
 readings (holes), a bar across the line of sight (occluder), a second object (object), an animal
 that disappears in the floor's noise or in glare (faint), stretches at two to three times the speed
 (fast), and missing frames (dropped). Objects are rendered with the scene; `Loss` is applied to the
-finished depth images; `seen_share` measures how much of the animal an occluder leaves visible.
+finished depth images; `visible_share` measures how much of the animal an occluder leaves visible.
 """
 
 from collections.abc import Callable
@@ -330,7 +330,9 @@ class Loss:
                 depth[np.hypot(u - u0, v - v0) < radius] = 0.0
 
 
-def seen_share(vertices: Array, objects: Array, camera: Camera, rows: NDArray[np.int64]) -> Array:
+def visible_share(
+    vertices: Array, objects: Array, camera: Camera, rows: NDArray[np.int64]
+) -> Array:
     """Share of the animal's vertices that are not occluded, 1 in frames other than `rows`.
 
     A vertex counts as occluded if it projects into the convex hull of the occluder's projection, as

@@ -438,10 +438,10 @@ def draw_views(rng: np.random.Generator, m: int, setting: SceneSpec = ARENA) -> 
     """
     tilt = setting.tilt_rad * np.sqrt(rng.random(m))
     toward = rng.uniform(-np.pi, np.pi, m)
-    return look_down(rng.uniform(*setting.camera_mm, m), tilt, toward)
+    return overhead_pose(rng.uniform(*setting.camera_mm, m), tilt, toward)
 
 
-def look_down(camera_mm: Array, tilt_rad: Array, toward_rad: Array) -> SE3:
+def overhead_pose(camera_mm: Array, tilt_rad: Array, toward_rad: Array) -> SE3:
     """Poses of cameras above a floor.
 
     Args:

@@ -322,7 +322,7 @@ def _with_objects(
     spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
     occluded = np.concatenate(spans) if spans else np.zeros(0, np.int64)
     occluder = objects[:, : objects.shape[1] // 2]
-    share = corruptions.seen_share(body[:, ::4], occluder, base.camera, occluded)
+    share = corruptions.visible_share(body[:, ::4], occluder, base.camera, occluded)
     contents = replace(
         contents,
         objects=objects if isinstance(base, HandSession) else in_arena,

@@ -111,8 +111,8 @@ def repeat_messages(
         )
         if not noisy:
             cautions.append(
-                f"{message}; the background has no noise, so a stream that froze looks like an "
-                "animal that keeps still: watch that part of the replay"
+                f"{message}; the background has no noise, so the animal may be still or the "
+                "stream frozen: watch that part of the replay"
             )
         else:
             (reasons if n > 0.1 * len(still) else cautions).append(  # a longer freeze needs review

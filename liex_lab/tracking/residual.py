@@ -542,7 +542,7 @@ class OcclusionCorrection:
         return replace(pose, root=SE3(pose.root.rotation, place))
 
     def _sight(self, joints: Array, crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
-        """The visible part (n, 5) of each animal, see `_look`, with its area over the usual one.
+        """The `_visible_part` (n, 5) of each animal, with its area over the usual one.
 
         Its joints (n, J, 3) mm are in the camera frame.
         """
@@ -552,7 +552,7 @@ class OcclusionCorrection:
         # an object nearer by this much is in front of the animal
         before = 2.0 * float(np.sqrt(self.scene.area_mm2))
         in_parallel(
-            _look,
+            _visible_part,
             len(ends),
             crops.heights,
             crops.origin,
@@ -568,7 +568,7 @@ class OcclusionCorrection:
 
 
 @kernel(nogil=True)
-def _look(heights, origin, step, distance, depths, ends, before, out, start, stop):
+def _visible_part(heights, origin, step, distance, depths, ends, before, out, start, stop):
     """Fill out (n, 5) with the visible pixels of each animal along its line from base to tip.
 
     ends (n, 2, 2) px are the line's ends. Columns: visible pixels times their squared depth; how

@@ -38,7 +38,7 @@ from liex_lab.tracking.residual import (
 )
 from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Flip, Subject, Tracked
-from liex_lab.tracking.trust import WHOLE, finite_median, median_of_whole, seen_share
+from liex_lab.tracking.trust import WHOLE, finite_median, median_of_whole, visible_share
 
 BRIDGE_S = 0.5
 
@@ -324,7 +324,7 @@ def _whole(
         crops = replace(crops, origin=crops.origin // scene.stride, step=crops.step // scene.stride)
     behind = behind_something(crops, scene.cleared(sample))
     shown = np.where(estimates.found, crops.n_px, np.nan)
-    share = seen_share(behind, shown, median_of_whole(shown, behind), 0)
+    share = visible_share(behind, shown, median_of_whole(shown, behind), 0)
     return ~estimates.found | (share >= WHOLE)
 
 

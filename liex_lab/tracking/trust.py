@@ -140,7 +140,7 @@ def share_in_view(observed: Observations, path: NDArray[np.int64], usual_px: flo
     """
     meant = np.where((path < 0) & observed.known[:, 0], 0, path)
     behind, shown = (observed.along(values, meant) for values in (observed.behind, observed.n_px))
-    return np.where(meant >= 0, seen_share(behind, shown, usual_px), 1.0)
+    return np.where(meant >= 0, visible_share(behind, shown, usual_px), 1.0)
 
 
 def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
@@ -156,7 +156,7 @@ def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
     return np.asarray((in_view < MOSTLY) | ((in_view < WHOLE) & (doubt > 0.25)))
 
 
-def seen_share(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAMES) -> Array:
+def visible_share(behind: Array, shown_px: Array, usual_px: float, beside: int = _FRAMES) -> Array:
     """The visible share (n,) of an animal that is partly behind a nearer object.
 
     Args:
@@ -186,7 +186,7 @@ def head_tail_weight(observed: Observations) -> Array:
     weight = np.ones(observed.score.shape)
     for h in range(observed.score.shape[1]):
         behind, shown = (values[:, h].astype(float) for values in (observed.behind, observed.n_px))
-        share = seen_share(behind, shown, usual_px)
+        share = visible_share(behind, shown, usual_px)
         weight[:, h] = np.clip((share - MOSTLY) / (WHOLE - MOSTLY), 0.0, 1.0) ** 2
     return weight
 

@@ -315,7 +315,7 @@ def _upright(points: Array, columns: list[int], up: str, path: Path) -> Array:
     if others and back < np.nanmedian(turned[:, others, 2]):
         raise LiexError(
             f"{path}: with '{up}' up the back lies {np.nanmedian(turned[:, others, 2]) - back:.0f} "
-            "mm below the other points; say which axis points up (--up)"
+            "mm below the other points; state which axis points up (--up)"
         )
     return turned[:, columns]
 

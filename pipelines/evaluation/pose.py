@@ -56,8 +56,8 @@ _FLIP_CLASSES = (0.0, 0.01, 0.05, 0.2, 0.5, 0.8, 1.0)  # of p_flip
 _SIZES_MM = {"mouse": (45.0, 65.0, 80.0, 100.0), "fish": (18.0, 25.0, 32.0, 45.0)}
 BUILDS_PROTOCOL = (
     "Rendered recordings of one moving animal each, of a build that no forest was trained on "
-    "(the tracker's calibration knows other animals of the same family of builds, and so does what "
-    "is said to be left by a fish's own shape; that shape is learned of a wider family, which "
+    "(the tracker's calibration knows other animals of the same family of builds, and so does "
+    "the stated remainder of a fish's own shape; that shape is learned of a wider family, which "
     "reaches about as far), filmed by "
     "makes of camera of the training's and of focal lengths that it had not, in turn, with "
     "0.7, 1 and 1.5 times their noise; background, floor, animal and size are found by the "

@@ -31,7 +31,7 @@ from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame
-from liex_lab.runtime.memory import peak_memory_mb, rest
+from liex_lab.runtime.memory import peak_memory_mb, release_memory
 from liex_lab.runtime.processes import Done, Processes, Work
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Provenance, Session, SessionWriter, cutouts, evidence, mcap, rrd
@@ -355,7 +355,7 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
     n = int(minutes * 60 * FPS)
     depth, observed, subject, origin = _measure_short(plan)
     origin = replace(origin, n_frames=n)
-    rest()
+    release_memory()
     began = time.perf_counter()
     with SessionWriter(Path(out) / "long.liex", origin, report=write_report) as writer:
         for frames, part in _parts(depth, observed, n):

@@ -58,7 +58,7 @@ def evaluate_scenes(
     n_frames: int = 300,
     n_recordings: int = 1,
     sealed: bool = False,
-    pictures: Path | None = None,
+    figures: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure rendered scenes that mimic lab recordings, and score the tables.
@@ -69,7 +69,7 @@ def evaluate_scenes(
         n_recordings: of each scene, each of another seed and animal; the first is of a build that
             no model was trained on, the second of one like the training's.
         sealed: measure on the sealed seeds, which are not for development.
-        pictures: folder of drawn frames, a PNG for each row; None draws none.
+        figures: folder of drawn frames, a PNG for each row; None draws none.
         progress: called row by row.
 
     Returns:
@@ -91,7 +91,7 @@ def evaluate_scenes(
     rows: dict[str, dict[str, Any]] = {}
     for k, name in enumerate(names):
         progress(k, len(names), f"scene {name}")
-        rows[name] = _measure_row(name, every[name], seeds[:n_recordings], n_frames, pictures)
+        rows[name] = _measure_row(name, every[name], seeds[:n_recordings], n_frames, figures)
         beside = rows.get(every[name][2], {}).get("mean_joint_error_mm")
         own = rows[name]["mean_joint_error_mm"]
         rows[name]["ratio_to_plain"] = own / beside if own and beside else None
@@ -110,7 +110,7 @@ def _measure_row(
     scene, of_plan, _ = case
     plan = plan_of(of_plan)
     tally = Tally()
-    said: list[str] = []
+    messages: list[str] = []
     exit_code = 0
     for k, seed in enumerate(seeds):
         recording = film(scene, seed, n_frames, family="train" if k % 2 else "other")
@@ -122,11 +122,11 @@ def _measure_row(
         tally.add(
             truths, individuals, n_frames, skeleton.tip, skeleton.name == plan.animal.skeleton
         )
-        said += [sentence for sentence in sentences if sentence not in said]
+        messages += [sentence for sentence in sentences if sentence not in messages]
         exit_code = max(exit_code, code)
         if folder is not None and k == 0:
             draw_scene(name, recording, truths, individuals, folder)
-    return {**tally.figures(), "said": said, "exit_code": exit_code}
+    return {**tally.figures(), "said": messages, "exit_code": exit_code}
 
 
 def run_product(
@@ -151,15 +151,15 @@ def run_product(
         except LiexError as error:
             return [], [str(error)], error.exit_code
         individuals: list[MeasuredIndividual] = []
-        said: list[str] = []
+        messages: list[str] = []
         codes = [0, *(error.exit_code for error in refused)]
         for path in sorted(Path(folder).glob("*.liex")):
             session = Session.open(path)
             verdict = verdict_in(session.metadata)
             individuals += read_individuals(session)
-            said += [verdict["sentence"], *session.metadata["problems"]]
+            messages += [verdict["sentence"], *session.metadata["problems"]]
             codes.append(MisfitError.exit_code if verdict["look_at_it"] else 0)
-    return individuals, [*said, *map(str, refused)], max(codes)
+    return individuals, [*messages, *map(str, refused)], max(codes)
 
 
 def read_individuals(session: Session) -> list[MeasuredIndividual]:

@@ -30,13 +30,13 @@ from liex_lab.sessions.folder import (
 from liex_lab.sessions.verdict import read_verdict
 
 from .status import (
-    LOOKING,
-    LookAtSession,
+    INSPECTING,
+    InspectSession,
     MeasuringStage,
     SessionStatus,
     about,
     input_stamp,
-    to_look_at,
+    review_note,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def measure_one(
     Returns:
         `id`, `state` (`done` or `failed`), `seconds`, `failure` (None if done); of a session that
         was measured also `corrections_taken_from` (the outdated session whose manual corrections
-        were copied; "" for none), and `look_at_it` (why it needs review; "" for nothing).
+        were copied; "" for none), and `review` (why it needs review; "" for nothing).
     """
     if run_id and (ended := _ended(session, run_id)):
         return ended
@@ -101,7 +101,7 @@ def measure_one(
         **_result(session, "done"),
         "seconds": round(time.perf_counter() - began, 3),
         "corrections_taken_from": taken_from(session.folder),
-        "look_at_it": to_look_at(read_verdict(session.folder)),
+        "review": review_note(read_verdict(session.folder)),
     }
 
 
@@ -177,18 +177,18 @@ class Crew:
         planned = [one.session for one in todo]
         return self._each(planned, task, "measuring", quarantine, report, finished, shared)
 
-    def look_at(
+    def inspect(
         self,
         sessions: Sequence[PlannedSession],
-        look: LookAtSession,
+        inspect: InspectSession,
         report: Report = lambda *_: None,
         finished: Finished = lambda _: None,
     ) -> list[dict[str, Any]]:
-        """Inspect sessions; returns the findings on each animal, see `sharing.look_at`.
+        """Inspect sessions; returns the findings on each animal, see `status.inspect_animal`.
 
         Args:
             sessions: the sessions.
-            look: inspects one session, `sharing.look_at`.
+            inspect: inspects one session, `status.inspect_animal`.
             report: called with id, pieces done, pieces in total, and the current step.
             finished: called with each result as it arrives.
         """
@@ -196,7 +196,7 @@ class Crew:
         def unobserved(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
             return about(session) | {"failure": failure}
 
-        return self._each(sessions, look, LOOKING, unobserved, report, finished)
+        return self._each(sessions, inspect, INSPECTING, unobserved, report, finished)
 
     def _each(
         self,

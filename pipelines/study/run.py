@@ -29,13 +29,13 @@ from ..compiling import compile_ahead
 from .cluster import SlurmTable, crew_of, is_encrypted
 from .crew import Crew, RunSession
 from .status import (
-    LookAtSession,
+    InspectSession,
     SessionStatus,
-    look_at,
+    inspect_animal,
+    pending_inspections,
+    review_note,
     standings,
-    to_be_looked_at,
-    to_look_at,
-    write_look,
+    write_inspection,
 )
 
 
@@ -97,7 +97,7 @@ def _measured(folder: Path) -> verdict.Entry:
     try:
         session = Session.open(folder)
         known = session.table("sessions").iloc[0].reindex([*verdict.SUBJECT]).to_dict()
-        reason = to_look_at(verdict.verdict_in(session.metadata))
+        reason = review_note(verdict.verdict_in(session.metadata))
     except LiexError as error:
         return verdict.Entry(folder.name, "failed", str(error))
     subject = {
@@ -200,7 +200,7 @@ def run_study(
     board: Callable[[int], AbstractContextManager[Board]],
     # writes descriptions into a session, with their author: `liex_lab.api.correct_session`
     describe: Callable[..., Path],
-    look: LookAtSession = look_at,
+    inspect: InspectSession = inspect_animal,
 ) -> list[SessionStatus]:
     """Measure the pending sessions of a study; returns every session's status.
 
@@ -216,7 +216,7 @@ def run_study(
         dry_run: only return the status.
         board: opens the display of so many sessions' progress.
         describe: writes descriptions into a session, `liex_lab.api.correct_session`.
-        look: inspects a session's animal.
+        inspect: inspects a session's animal.
 
     Raises:
         StudyError: both scheduler and slurm are given, or no scheduler answers at that address.
@@ -234,8 +234,11 @@ def run_study(
     before = ask()
     if dry_run:
         return before
-    unseen = to_be_looked_at(study, only, retry, again)
-    written = [*(one.session.folder for one in before), *(session.folder for session in unseen)]
+    pending = pending_inspections(study, only, retry, again)
+    written = [
+        *(one.session.folder for one in before),
+        *(session.folder for session in pending),
+    ]
     for place in (study.cohort_folder, *written):
         durable.unlinked_below(study.results, place)
     study.cohort_folder.mkdir(parents=True, exist_ok=True)
@@ -243,9 +246,9 @@ def run_study(
         study.cohort_folder / ".lock",
         f"the study {study.name} is being measured by another process",
     ):
-        with _crew(before, unseen, workers=workers, scheduler=scheduler, slurm=table) as crew:
-            if unseen and crew:
-                _look(unseen, look, crew, board)
+        with _crew(before, pending, workers=workers, scheduler=scheduler, slurm=table) as crew:
+            if pending and crew:
+                _inspect(pending, inspect, crew, board)
                 before = ask()
             for one in before:
                 if one.described:
@@ -264,25 +267,25 @@ def _to_measure(found: Sequence[SessionStatus]) -> list[SessionStatus]:
 
 @contextmanager
 def _crew(
-    found: Sequence[SessionStatus], unseen: Sequence[PlannedSession], **where: Any
+    found: Sequence[SessionStatus], pending: Sequence[PlannedSession], **where: Any
 ) -> Iterator[Crew | None]:
     """Workers for the pending sessions; None if there are none."""
     todo = [one.session for one in _to_measure(found)]
-    if not todo and not unseen:
+    if not todo and not pending:
         yield None
         return
 
     if not where["scheduler"] and not where["slurm"]:  # once, instead of in every worker
-        compile_ahead(*sorted({session.plan.animal.skeleton for session in [*todo, *unseen]}))
+        compile_ahead(*sorted({session.plan.animal.skeleton for session in [*todo, *pending]}))
     # inspecting one session may make others of its animal pending
-    most = sum(one.state != "excluded" for one in found) if unseen else len(todo)
-    with crew_of(max(most, len(unseen)), **where) as crew:
+    most = sum(one.state != "excluded" for one in found) if pending else len(todo)
+    with crew_of(max(most, len(pending)), **where) as crew:
         yield crew
 
 
-def _look(
+def _inspect(
     sessions: Sequence[PlannedSession],
-    look: LookAtSession,
+    inspect: InspectSession,
     crew: Crew,
     board: Callable[[int], AbstractContextManager[Board]],
 ) -> None:
@@ -291,12 +294,12 @@ def _look(
     with board(len(sessions)) as shown:
 
         def finished(found: dict[str, Any]) -> None:
-            write_look(known[found["session_id"]], found)
+            write_inspection(known[found["session_id"]], found)
             failure = found.get("failure")
             done = failure or f"shows an animal of {found['animal']['spine_mm']:.1f} mm"
-            _ended(shown, found["session_id"], "could not be looked at", done)
+            _ended(shown, found["session_id"], "could not be inspected", done)
 
-        crew.look_at(sessions, look, shown.report, finished)
+        crew.inspect(sessions, inspect, shown.report, finished)
 
 
 def _ended(shown: Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
@@ -317,8 +320,8 @@ def _measure(
             """Report the `result` of a session to the board."""
             copy = result.get("corrections_taken_from")
             taken = f", with the corrections of {copy}" if copy else ""
-            look = f"; {why}" if (why := result.get("look_at_it")) else ""
-            done = f"is done, in {result['seconds']:.0f} s{taken}{look}"
+            review = f"; {why}" if (why := result.get("review")) else ""
+            done = f"is done, in {result['seconds']:.0f} s{taken}{review}"
             _ended(shown, result["id"], "failed", result["failure"] or done)
 
         crew.measure(todo, run, shown.report, finished)

@@ -1,7 +1,7 @@
 """Status of a study's sessions: done, failed, or pending (again) and why; read from disk.
 
 No state is kept: a session is done while versions, plan, model and input in its session.json are
-current. If sessions share the size and shape of their animal, each is looked at first (look.json).
+current. If sessions share the size and shape of their animal, each is inspected first (look.json).
 """
 
 import hashlib
@@ -31,16 +31,16 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.folder import describe_failure, read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
-from liex_lab.sessions.verdict import CAUTION, LOOK_AT_IT, state_in_words, verdict_in
+from liex_lab.sessions.verdict import CAUTION, NEEDS_REVIEW, state_in_words, verdict_in
 from liex_lab.tracking.own_shape import MOST_APART, SessionBody, agree, spread_of
 
 from ..build import animal_facts, build_estimator, build_recording, open_planned, shape_labels
 from ..choice import fit_plan
 from ..session import MEASURING
 
-LOOKING = "looking at the animal"
+INSPECTING = "inspecting the animal"
 _DECIMALS = 4  # of a shape, relative to the length or to the average animal
-LookAtSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
+InspectSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
 
 
 def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:
@@ -152,7 +152,7 @@ class _AnimalFound(_Part):
     shape: _ShapeFound | None = None
 
 
-class _Look(_Part):
+class _Inspection(_Part):
     """The entries of look.json that are read if an animal was found."""
 
     animal: _AnimalFound
@@ -170,14 +170,14 @@ def shared_sessions(study: Study) -> list[tuple[PlannedSession, str]]:
     """
     known = {session.id: (session, "") for session in study.sessions}
     for group in _groups(study):
-        looks: dict[str, Any] = {session.id: read_look(session) for session in group}
-        missing = next((id for id, look in looks.items() if look is None), "")
-        members = group if missing else together(group, looks)
+        inspections: dict[str, Any] = {session.id: read_inspection(session) for session in group}
+        missing = next((id for id, inspection in inspections.items() if inspection is None), "")
+        members = group if missing else together(group, inspections)
         known |= {session.id: (session, missing) for session in members}
     return list(known.values())
 
 
-def to_be_looked_at(
+def pending_inspections(
     study: Study, only: Sequence[str] = (), retry: bool = False, again: bool = False
 ) -> list[PlannedSession]:
     """Sessions to inspect before others of their animal are measured.
@@ -190,8 +190,8 @@ def to_be_looked_at(
     """
 
     def is_pending(session: PlannedSession) -> bool:
-        look = None if again else read_look(session)
-        return look is None or (retry and "failure" in look)
+        inspection = None if again else read_inspection(session)
+        return inspection is None or (retry and "failure" in inspection)
 
     groups = [g for g in _groups(study) if not only or any(one.id in only for one in g)]
     return [session for group in groups for session in group if is_pending(session)]
@@ -211,11 +211,13 @@ def _groups(study: Study) -> list[list[PlannedSession]]:
 
 
 def together(
-    group: Sequence[PlannedSession], looks: Mapping[str, dict[str, Any]]
+    group: Sequence[PlannedSession], inspections: Mapping[str, dict[str, Any]]
 ) -> list[PlannedSession]:
     """The sessions of one animal with the shared values in their plans, or why there are none."""
     subject = group[0].animal.id
-    taking_part = {s.id: found_in(looks[s.id]) for s in group if not _why_not(looks[s.id])}
+    taking_part = {
+        s.id: found_in(inspections[s.id]) for s in group if not _why_not(inspections[s.id])
+    }
     alone = f"The sessions of {subject} do not share size and shape"
     if len(taking_part) < 2:
         shown_by = "one of them alone" if taking_part else "none of them"
@@ -243,26 +245,26 @@ def together(
         else replace(
             s,
             remark=f"{s.id} does not share size and shape with the other sessions of {subject}: "
-            f"{_why_not(looks[s.id])}.",
+            f"{_why_not(inspections[s.id])}.",
         )
         for s in group
     ]
 
 
-def _why_not(look: Mapping[str, Any]) -> str:
+def _why_not(inspection: Mapping[str, Any]) -> str:
     """Why a session is not used for its animal's shared values; '' if it is."""
-    if "failure" in look:
-        return str(look["failure"].get("reason", ""))
-    return ", and ".join(map(str, look["misfits"]))
+    if "failure" in inspection:
+        return str(inspection["failure"].get("reason", ""))
+    return ", and ".join(map(str, inspection["misfits"]))
 
 
-def found_in(look: Mapping[str, Any]) -> SessionBody:
-    """The findings on an animal, from `look_at` of a session that shows it.
+def found_in(inspection: Mapping[str, Any]) -> SessionBody:
+    """The findings on an animal, from `inspect_animal` of a session that shows it.
 
     Raises:
         ValueError: it is damaged.
     """
-    read = _Look.model_validate(look)
+    read = _Inspection.model_validate(inspection)
     shape = read.animal.shape or _ShapeFound()
     stated = shape.model_dump(include={"width", "height", "joints_moved"})
     return SessionBody(
@@ -307,7 +309,7 @@ class MeasuringStage:
         self._progress(done, total, what)
 
 
-def look_at(session: PlannedSession, progress: Progress = silent) -> dict[str, Any]:
+def inspect_animal(session: PlannedSession, progress: Progress = silent) -> dict[str, Any]:
     """Estimate the animal's size and shape from a session's sampled frames, without writing files.
 
     Returns:
@@ -342,7 +344,7 @@ def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
         in_background(partial(build_estimator, plan)) as estimator,
         build_recording(session.recording, plan, progress) as opened,
     ):
-        progress(0, None, LOOKING)
+        progress(0, None, INSPECTING)
         fitted = fit_plan(opened, plan, estimator, progress=progress)
     tracker = fitted.tracker
     fit = tracker.sample_fit
@@ -356,40 +358,40 @@ def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
     }
 
 
-def look_file(session: PlannedSession) -> Path:
+def inspection_file(session: PlannedSession) -> Path:
     """The path of a session's look.json, next to its results."""
     return session.folder.with_name("look.json")
 
 
-def write_look(session: PlannedSession, look: dict[str, Any]) -> None:
+def write_inspection(session: PlannedSession, inspection: dict[str, Any]) -> None:
     """Write the findings on a session atomically."""
-    file = look_file(session)
+    file = inspection_file(session)
     durable.unlinked(file.parent).mkdir(parents=True, exist_ok=True)
     durable.write_whole(
-        file, json.dumps(durable.storable_document(look), indent=1, default=str) + "\n"
+        file, json.dumps(durable.storable_document(inspection), indent=1, default=str) + "\n"
     )
 
 
-def read_look(session: PlannedSession) -> dict[str, Any] | None:
+def read_inspection(session: PlannedSession) -> dict[str, Any] | None:
     """The stored findings on a session; None if there are none, or they are outdated.
 
     If the recording is gone, they remain valid as long as the rest is unchanged.
     """
     try:
-        look = json.loads(look_file(session).read_text(encoding="utf-8"))
-        failed = "failure" in look
+        inspection = json.loads(inspection_file(session).read_text(encoding="utf-8"))
+        failed = "failure" in inspection
         if not failed and not session.recording_exists:
-            look = look | {"input": {"stamp": input_stamp(session.recording)}}
-        if what_changed(session, look):
+            inspection = inspection | {"input": {"stamp": input_stamp(session.recording)}}
+        if what_changed(session, inspection):
             return None
-        if not _why_not(look) and not failed:
-            found = found_in(look)
+        if not _why_not(inspection) and not failed:
+            found = found_in(inspection)
             n_joints = Skeleton.load(session.plan.animal.skeleton).n_joints
             if found.shape is not None and len(found.shape) != 3 * n_joints + 2 * N_PLACES:
                 return None
     except (OSError, LiexError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
-    return dict(look)
+    return dict(inspection)
 
 
 State = Literal["done", "failed", "new", "begun", "changed", "excluded"]
@@ -480,7 +482,7 @@ def standing(session: PlannedSession, waits_for: str = "") -> SessionStatus:
         return SessionStatus(session, "excluded", session.exclude)
     file = session.folder / "session.json"
     if waits_for and file.is_file():
-        why = f"it shares size and shape with {waits_for}, which is to be looked at first"
+        why = f"it shares size and shape with {waits_for}, which is inspected first"
         return SessionStatus(session, "changed", why)
     if file.is_file():
         return _measured(session, file)
@@ -500,16 +502,16 @@ def _measured(session: PlannedSession, file: Path) -> SessionStatus:
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
         why = what_changed(session, document)
-        described = {} if why else _described_anew(session, document)
+        described = {} if why else _changed_description(session, document)
     except (OSError, ValueError, LiexError, AttributeError, TypeError, KeyError, RecursionError):
         why = "its session.json cannot be read"
     if described:
         listed = ", ".join(f"{key} = {value or 'unknown'}" for key, value in described.items())
-        why = f"described anew: {listed}; nothing is measured again"
+        why = f"description changed: {listed}; nothing is measured again"
     if why:
         return SessionStatus(session, "changed", why, described=described)
     input = str(document.get("input", {}).get("sha256", ""))
-    return SessionStatus(session, "done", to_look_at(verdict_in(document)), input=input)
+    return SessionStatus(session, "done", review_note(verdict_in(document)), input=input)
 
 
 def to_check(found: Sequence[SessionStatus]) -> list[str]:
@@ -544,7 +546,7 @@ def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
     return notes
 
 
-def to_look_at(verdict: Mapping[str, Any]) -> str:
+def review_note(verdict: Mapping[str, Any]) -> str:
     """Why a session that is done needs review, and cautions about it.
 
     Returns:
@@ -553,13 +555,13 @@ def to_look_at(verdict: Mapping[str, Any]) -> str:
     sentences = []
     if verdict["look_at_it"]:
         accepted = ", accepted" if verdict["accepted"] else ""
-        sentences.append(f"{LOOK_AT_IT}{accepted}: {'; '.join(map(str, verdict['reasons']))}")
+        sentences.append(f"{NEEDS_REVIEW}{accepted}: {'; '.join(map(str, verdict['reasons']))}")
     if verdict["cautions"]:
         sentences.append(f"{CAUTION}: {'; '.join(map(str, verdict['cautions']))}")
     return ". ".join(sentences)
 
 
-def _described_anew(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:
+def _changed_description(session: PlannedSession, document: dict[str, Any]) -> dict[str, str]:
     """Descriptions in the plan that differ from those of the results; '' removes one."""
     stated = session.plan.session.model_dump()
     then = Plan.from_table(document.get("plan", {})).session.model_dump()

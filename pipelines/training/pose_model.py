@@ -261,7 +261,7 @@ def make_model(
         # separate random streams, so that each step can be repeated by itself
         model = calibrate(model, unseen, np.random.default_rng([recipe.seed, 1]))
     if method.tells_facing:
-        progress(steps - 1, steps, "learning to tell head from tail")
+        progress(steps - 1, steps, "training the head-tail classifier")
         first = recipe.n_images + recipe.n_correction + recipe.n_calibration
         unseen = rendered_set(skeleton, method, recipe, first, recipe.n_images, silent)
         model = with_facing(model, unseen, recipe.seed)
@@ -668,7 +668,7 @@ def train_baseline(
 
 
 def fit(
-    training: Training, data: Any, skeleton: Skeleton, tell: ProgressCallback
+    training: Training, data: Any, skeleton: Skeleton, progress: ProgressCallback
 ) -> baseline.RegressionForest | baseline.Cnn:
     """Train a baseline on rendered images.
 
@@ -677,5 +677,5 @@ def fit(
     """
     rng = np.random.default_rng(training.recipe.seed)
     if isinstance(training.plan, baseline.CnnPlan):
-        return baseline.train_cnn(data, skeleton, training.plan, rng, tell)
-    return baseline.train_forests(data, skeleton, training.plan, rng, tell)
+        return baseline.train_cnn(data, skeleton, training.plan, rng, progress)
+    return baseline.train_forests(data, skeleton, training.plan, rng, progress)

@@ -9,7 +9,7 @@ import pytest
 from liex_lab.behaviour.body import STANDS, SWIMS, BodyAxis
 from liex_lab.behaviour.kinematics import Joints, kinematics, neighbours, segments
 from liex_lab.recordings.timestamps import find_gaps, median_step
-from liex_lab.runtime.memory import on_disk, rest
+from liex_lab.runtime.memory import on_disk, release_memory
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows
 from tests.behaviour.swimming_fish import SwimmingFish
@@ -55,7 +55,7 @@ def test_a_table_on_disk_made_in_blocks_is_the_one_in_memory(swims, tmp_path, mo
     in_memory = kinematics(*told, surface_z_mm=90.0)
     monkeypatch.setattr(import_module("liex_lab.behaviour.kinematics"), "_BLOCK", 16)
     on_the_disk = kinematics(*told, surface_z_mm=90.0, allocate=on_disk(tmp_path))
-    rest()
+    release_memory()
     pd.testing.assert_frame_equal(on_the_disk, in_memory, check_exact=True)
     if not swims:
         of_track = kinematics(told[0], Joints.of_track(mouse.track()))

@@ -173,7 +173,7 @@ def test_animals_that_were_in_both_groups_are_compared_with_themselves():
     [
         (study(3), "3 b and 3 a animals can be arranged in 20 ways, so p cannot be below 0.1"),
         (study(1), "the group a has 1 animals with a value"),
-        (study(5).assign(subject_id=""), "10 sessions do not say which animal"),
+        (study(5).assign(subject_id=""), "10 sessions have no subject_id"),
         (study(5, values=[1.0] * 10), "every unit has the same value"),
         (study(5, values=[np.nan] * 5 + [1.0] * 5), "the group a has 0 animals"),
         (study(5, cage=["c1"] * 4 + [""] * 6), "the cage of 6 of 10 animals is not stated"),

@@ -183,7 +183,7 @@ def test_run_ends_with_how_it_went_and_exit_code_4_where_someone_has_to_look(
     assert f"on disk: {size / 1e6:.1f} MB" in result.output
     last = result.output.strip().splitlines()[-1]
     assert last.startswith("result:  9 frames, 8 with a pose (89%), 7 of them trusted")
-    assert ("look at it" in last) == bool(reasons)
+    assert ("needs review" in last) == bool(reasons)
 
 
 def test_doctor_prints_json_that_holds_no_nan(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,7 +225,7 @@ CALLS: list[tuple[str, str, Any, tuple[Any, ...], dict[str, Any], str]] = [
         "evaluation.scenes.evaluate_scenes",
         {"rows": {"plain": SCENE}, "protocol": "found: share"},
         (["plain", "raised"],),
-        {"n_frames": 60, "n_recordings": 1, "sealed": False, "pictures": None},
+        {"n_frames": 60, "n_recordings": 1, "sealed": False, "figures": None},
         "| plain | 0.988 | – | look here; and here |",
     ),
     (

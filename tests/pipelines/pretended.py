@@ -75,8 +75,8 @@ def pretended_run(
     return folder
 
 
-def pretended_look(session: PlannedSession, progress: Progress) -> dict[str, Any]:
-    """Stands in for `sharing.look_at`: the recording holds the animal's length, mm."""
+def pretended_inspection(session: PlannedSession, progress: Progress) -> dict[str, Any]:
+    """Stands in for `status.inspect_animal`: the recording holds the animal's length, mm."""
     from liex_lab.pipelines.study.status import about
 
     from liex_lab.catalog import find_model, sha256
@@ -84,7 +84,7 @@ def pretended_look(session: PlannedSession, progress: Progress) -> dict[str, Any
     path = Path(session.recording)
     with (path.parents[1] / f"{path.stem}.looks").open("a") as file:
         file.write("x")
-    progress(0, None, "looking at the animal")
+    progress(0, None, "inspecting the animal")
     if path.stem.startswith("deadly"):
         os.kill(os.getpid(), signal.SIGKILL)
     if path.stem.startswith("empty"):

@@ -138,7 +138,7 @@ def test_every_session_of_a_study_is_accounted_for(accounted):
         found = compare([accounted / place], accounted / "out", ["distance_m"])
         said = found["sessions"]
         assert said == (
-            "10 sessions in the study, 7 compared: m1 has cautions; m2 look at it; m7 failed; "
+            "10 sessions in the study, 7 compared: m1 has cautions; m2 needs review; m7 failed; "
             "m8 not measured; m9 excluded"
         )
         assert "m2: it is a fish" in found["check"]
@@ -150,7 +150,7 @@ def test_every_session_of_a_study_is_accounted_for(accounted):
 def test_only_trusted_leaves_out_sessions_that_need_review(accounted):
     found = compare([accounted / "results"], accounted / "out", ["distance_m"], only_trusted=True)
     assert (
-        "10 sessions in the study, 6 compared: m1 has cautions; m2 left out, look at it; "
+        "10 sessions in the study, 6 compared: m1 has cautions; m2 left out, needs review; "
         in (found["sessions"])
     )
     assert found["check"] == []

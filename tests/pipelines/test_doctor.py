@@ -289,7 +289,7 @@ CASES: dict[str, tuple[Callable[[Path], Path], list[str], list[str], dict[str, A
     "a tilted camera": (
         images(np.rint(SIDE)[None].repeat(6, axis=0).astype("u2"), camera=CAMERA),
         [],
-        ["looks down at 23 degrees from straight"],
+        ["tilted by 23 degrees from the vertical"],
         {"floor_tilt_rad": pytest.approx(0.4, abs=0.01)},
     ),
     "a noisy camera": (

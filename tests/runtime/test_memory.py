@@ -16,7 +16,7 @@ import pytest
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.recordings.formats.messages import messages
-from liex_lab.runtime.memory import blocks, check_limits, mapped, on_disk, rest, why_short
+from liex_lab.runtime.memory import blocks, check_limits, mapped, on_disk, release_memory, why_short
 from liex_lab.sessions.folder import describe_failure
 
 _MB = 1 << 20
@@ -31,7 +31,7 @@ def test_what_is_written_stays_when_its_memory_is_let_go_of_and_no_file_is_left(
     array = on_disk(tmp_path)((1000, 3), np.float64)
     part = array[10:20]
     part[:] = np.arange(30.0).reshape(10, 3)
-    rest()
+    release_memory()
     for _ in blocks(3, 1):
         part[0] += 100.0
     part[0] -= 300.0

@@ -25,7 +25,7 @@ def floor_below(distance_mm: float, tilt_deg: float) -> Floor:
     [
         (200.0, 0.0, ""),
         (2900.0, 9.0, ""),
-        (700.0, 35.0, "looks down at 35 degrees"),
+        (700.0, 35.0, "tilted by 35 degrees"),
         (70.0, 0.0, "70 mm from the camera"),
         (7000.0, 0.0, "7000 mm from the camera"),
     ],

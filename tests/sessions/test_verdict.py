@@ -1,4 +1,4 @@
-"""The verdict on a session: what was measured, what is to be distrusted, and when to look at it."""
+"""The verdict on a session: what was measured, what to distrust, and when it needs review."""
 
 import json
 from collections.abc import Callable
@@ -38,14 +38,14 @@ def hardly_covered(seen: Observations) -> None:
     ("change", "more", "sentence"),
     [
         (nothing, {}, "^200 frames, 200 with a pose (100%), 200 of them trusted"),
-        (nothing, {"doubts": ["the camera was pushed"]}, "look at it: the camera was pushed$"),
+        (nothing, {"doubts": ["the camera was pushed"]}, "needs review: the camera was pushed$"),
         (gone_after(90), {}, "^200 frames, 90 with a pose"),
-        (gone_after(20), {}, "look at it: an animal is measured in"),
-        (hardly_covered, {}, "look at it: only 80 of the 200 frames with an object"),
+        (gone_after(20), {}, "needs review: an animal is measured in"),
+        (hardly_covered, {}, "needs review: only 80 of the 200 frames with an object"),
         (
             nothing,
             {"misfits": ["it is 743 mm long"], "n_animals": 2, "accepted": True},
-            "look at it (accepted): it is 743 mm long. note: 2 animals are in view",
+            "needs review (accepted): it is 743 mm long. note: 2 animals are in view",
         ),
     ],
 )
@@ -57,8 +57,8 @@ def test_a_sentence_states_the_quality_and_why_a_session_needs_review(
     verdict = Verdict.of(track_whole(SUBJECT, seen).track, seen, **more)
     assert sentence.strip("^$") in verdict.sentence
     assert not sentence.startswith("^") or verdict.sentence.startswith(sentence[1:])
-    assert verdict.look_at_it == ("look at it" in sentence)
-    assert ("look at it" in verdict.sentence) == verdict.look_at_it
+    assert verdict.needs_review == ("needs review" in sentence)
+    assert ("needs review" in verdict.sentence) == verdict.needs_review
     assert "\n" not in verdict.sentence
     assert verdict.n_frames == 200
     if change is hardly_covered:
@@ -81,5 +81,5 @@ def test_of_no_pose_there_is_no_error_to_expect() -> None:
     verdict = Verdict.of(track_whole(SUBJECT, seen).track, seen)
     assert verdict.expected_error_mm is None
     assert verdict.n_animals == 0
-    assert verdict.look_at_it
+    assert verdict.needs_review
     assert pytest.approx(0) == verdict.n_trusted

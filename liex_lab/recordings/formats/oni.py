@@ -104,7 +104,7 @@ class OniFile:
             )
         if not (1, 0, 0, 4) <= version <= _NEWEST:
             raise RecordingError(
-                f"{path} says that it is of version {'.'.join(map(str, version))} of its format, "
+                f"{path} states version {'.'.join(map(str, version))} of its format, "
                 "and versions 1.0.0.4 to 1.0.1.0 can be read; record it again with OpenNI2, or "
                 "copy it again if it is damaged"
             )

@@ -628,7 +628,7 @@ class HandSimulator:
         """Source of the training images, one phrase."""
         return (
             "rendered from a seed; postures partly drawn from statistics of labelled points of "
-            f"the NYU Hand Pose test frames 1 to {N_FIRST_PERSON}; no image of a hand was used"
+            f"the NYU Hand Pose test frames 1 to {N_FIRST_PERSON}; no picture of a hand was used"
         )
 
     def training_blocks(

@@ -21,7 +21,7 @@ from liex_lab.simulation.scene import (
     SimulatedScene,
     draw_object,
     floor_point,
-    look_down,
+    overhead_pose,
     turned,
 )
 from liex_lab.simulation.scenes import places
@@ -248,7 +248,9 @@ class Making:
         rng = self._rng("camera")
         camera = self.sensor.camera
         toward = np.pi / 2 + float(rng.uniform(-0.3, 0.3))
-        T_arena_camera = look_down(*np.array([[recipe.camera_mm], [recipe.tilt_rad], [toward]]))[0]
+        T_arena_camera = overhead_pose(
+            *np.array([[recipe.camera_mm], [recipe.tilt_rad], [toward]])
+        )[0]
         whole = SimulatedScene(
             camera,
             T_arena_camera,

@@ -14,7 +14,7 @@ from liex_lab.simulation.scenes.catalogue import SEALED_FROM
 
 @pytest.mark.slow
 def test_a_mouse_in_a_plain_arena_is_measured(tmp_path):
-    result = evaluate_scenes(["plain"], n_frames=30, pictures=tmp_path)
+    result = evaluate_scenes(["plain"], n_frames=30, figures=tmp_path)
     row = result["rows"]["plain"]
     assert (row["n_frames"], row["exit_code"], row["ratio_to_plain"]) == (30, 0, 1.0)
     assert row["found"] > 0.9

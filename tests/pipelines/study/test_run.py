@@ -205,7 +205,7 @@ def test_who_an_animal_is_changes_without_measuring(
     state, reason = why(file)
     assert (state, reason) == (
         "changed",
-        "described anew: group = drug, cage = c1; nothing is measured again",
+        "description changed: group = drug, cage = c1; nothing is measured again",
     )
     described = []
 
@@ -263,13 +263,13 @@ def test_a_session_that_someone_has_to_look_at_is_done_and_says_why(
     document = json.loads(path.read_text())
     verdict = Verdict(40, 40, 39, 3, 9.0, 1, ("only 3 of the 40 frames are trusted",))
     path.write_text(json.dumps(document | {"verdict": verdict.to_dict()}))
-    assert why(file) == ("done", "look at it: only 3 of the 40 frames are trusted")
+    assert why(file) == ("done", "needs review: only 3 of the 40 frames are trusted")
     result = CliRunner().invoke(cli.app, ["cohort", str(file)])
     assert result.exit_code == 0, result.output
     listed, counted = result.output.strip().splitlines()
-    reason = "look at it: only 3 of the 40 frames are trusted"
+    reason = "needs review: only 3 of the 40 frames are trusted"
     assert listed.split() == ["done", session.id, *reason.split()]
-    assert counted == "1 session: 1 done, look at it"
+    assert counted == "1 session: 1 done, needs review"
     (entry,) = list_sessions(file)[1]()
     assert (entry.state, entry.reason) == why(file)
 

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from liex_lab.pipelines.study.status import look_file
+from liex_lab.pipelines.study.status import inspection_file
 
 from liex_lab import api
 from liex_lab.plan.study import Study
@@ -33,7 +33,7 @@ def test_two_sessions_of_one_mouse_have_one_length_and_the_report_says_whose(
     assert {status.state for status in api.run_study(file)} == {"done"}
     found, animals = [], []
     for session in Study.load(file).sessions:
-        found.append(json.loads(look_file(session).read_text())["animal"]["spine_mm"])
+        found.append(json.loads(inspection_file(session).read_text())["animal"]["spine_mm"])
         animals.append(json.loads((session.folder / "session.json").read_text())["animal"])
         page = (session.folder / "report.html").read_text(encoding="utf-8")
         assert "shared by 2 sessions of m07" in page

@@ -13,16 +13,16 @@ from liex_lab.pipelines.study.crew import measure_one
 from liex_lab.pipelines.study.run import list_sessions, run_study, study_rows
 from liex_lab.pipelines.study.status import (
     SessionStatus,
+    pending_inspections,
     shared_sessions,
     standings,
-    to_be_looked_at,
 )
 
 from liex_lab.errors import LiexError, PlanError, StudyError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
 from liex_lab.runtime.progress import Board
-from tests.pipelines.pretended import pretended_look, pretended_run
+from tests.pipelines.pretended import pretended_inspection, pretended_run
 
 Sessions = dict[str, float]  # "m07/name" and the length that its recording shows, mm
 
@@ -30,9 +30,9 @@ Sessions = dict[str, float]  # "m07/name" and the length that its recording show
 class Here:
     """A crew of this process alone: what a worker does is the same."""
 
-    def look_at(self, sessions: Any, look: Any, told: Any, finished: Any) -> None:
+    def inspect(self, sessions: Any, inspect: Any, told: Any, finished: Any) -> None:
         for session in sessions:
-            finished(look(session, lambda *_: None))
+            finished(inspect(session, lambda *_: None))
 
     def measure(self, todo: Any, run: Any, told: Any, finished: Any) -> None:
         for one in todo:
@@ -80,7 +80,7 @@ def run(file: Path, **more: Any) -> dict[str, SessionStatus]:
         "dry_run": False,
         "board": lambda n: nullcontext(Board(n, lambda _: None)),
         "describe": correct_session,
-        "look": pretended_look,
+        "inspect": pretended_inspection,
     }
     found = run_study(Study.load(file), pretended_run, **(settings | more))
     return {one.session.id.rpartition("-")[2]: one for one in found}
@@ -140,10 +140,10 @@ def test_an_interrupted_study_goes_on_to_the_same_and_looks_at_nobody_twice(
         if len(looked) == 2:
             raise KeyboardInterrupt
         looked.append(session.id)
-        return pretended_look(session, progress)
+        return pretended_inspection(session, progress)
 
     with pytest.raises(KeyboardInterrupt):
-        run(cut, look=interrupted)
+        run(cut, inspect=interrupted)
     states = [one.state for one in standings(Study.load(cut))]
     assert states == ["new"] * 3
     found = run(cut)
@@ -173,7 +173,7 @@ def test_another_session_changes_what_all_of_its_animal_are_measured_with(tmp_pa
     file = make_study(tmp_path, {**lengths, "m07/c": 86.0})
     waiting = {one.session.id.rpartition("-")[2]: one for one in standings(Study.load(file))}
     assert waiting["a"].state == "changed"
-    assert "sub-m07_ses-c, which is to be looked at first" in waiting["a"].reason
+    assert "sub-m07_ses-c, which is inspected first" in waiting["a"].reason
     assert (waiting["c"].state, waiting["x"].state) == ("new", "done")
     found = run(file)
     assert measured_by(found["a"])["n_sessions"] == 3
@@ -235,7 +235,7 @@ def test_who_an_animal_is_changes_without_a_look(tmp_path: Path) -> None:
     file = make_study(tmp_path, {"m07/a": 80.0, "m07/b": 82.0})
     run(file)
     file.write_text(file.read_text().replace('id = "m07"', 'id = "m07"\ngroup = "drug"'))
-    assert to_be_looked_at(Study.load(file)) == []
+    assert pending_inspections(Study.load(file)) == []
     found = {one.session.id[-1]: one for one in standings(Study.load(file))}
     assert found["a"].described == {"group": "drug"}
 
@@ -256,9 +256,9 @@ def test_a_look_outlives_its_recording_and_a_damaged_one_is_made_again(tmp_path:
     found = run(file)
     recording = tmp_path / "rawdata" / "a.mcap"
     shutil.move(recording, tmp_path / "a.mcap")
-    assert to_be_looked_at(Study.load(file)) == []
+    assert pending_inspections(Study.load(file)) == []
     shutil.move(tmp_path / "a.mcap", recording)
-    look = status.look_file(found["a"].session)
+    look = status.inspection_file(found["a"].session)
     good = json.loads(look.read_text())
     for text in (
         "",
@@ -273,7 +273,7 @@ def test_a_look_outlives_its_recording_and_a_damaged_one_is_made_again(tmp_path:
         json.dumps({key: value for key, value in good.items() if key != "misfits"}),
     ):
         look.write_text(text)
-        assert [one.id for one in to_be_looked_at(Study.load(file))] == ["sub-m07_ses-a"], text
+        assert [one.id for one in pending_inspections(Study.load(file))] == ["sub-m07_ses-a"], text
     assert run(file)["a"].state == "done"
     assert counted(tmp_path, "a", "runs") == 1, "it found the same"
 

@@ -286,7 +286,7 @@ class NyuReference:
                 names = [str(name) for name in table["joint_names"]]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise LiexError(
-                f"{path} is not a whole file of NYU labels ({error}); copy it anew"
+                f"{path} is not a whole file of NYU labels ({error}); copy it again"
             ) from None
         if names != list(POINTS) or truth.shape[1:] != (len(POINTS), 3):
             raise LiexError(

@@ -495,8 +495,8 @@ def _camera(
     if not min(size):
         raise RecordingError(
             f"{path} holds points that lie in no image on {printable(topic.name)}; write a "
-            "camera.toml beside it with [camera], width = ... and height = ... in pixels, to say "
-            "which image shows them"
+            "camera.toml beside it with [camera], width = ... and height = ... in pixels, to "
+            "state the image that shows them"
         )
     return camera_file.camera(*size, stated)
 

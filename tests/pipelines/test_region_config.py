@@ -155,7 +155,7 @@ def test_what_changed_meanwhile_or_is_a_link_is_not_overwritten(
 
 def test_a_recording_that_was_not_measured_is_seen_whole_and_gets_a_region(study: Path) -> None:
     stated = StatedRegions(study)
-    depth, camera = stated.picture(KEY)
+    depth, camera = stated.depth_image(KEY)
     assert depth.shape == (camera.height, camera.width)
     assert (depth > 0).mean() > 0.8
     stated.save(KEY, None, "recording", BOX, None)
