@@ -20,7 +20,7 @@ from urllib.parse import parse_qsl
 
 from pydantic import Field, ValidationError, model_validator
 
-from liex_lab.errors import PlanError, StudyError, did_you_mean
+from liex_lab.errors import PlanError, StudyError, did_you_mean, refuse
 from liex_lab.plan import Plan, known_plans
 from liex_lab.plan.sections import ArenaPlace, SettingsTable, first_twice
 from liex_lab.runtime import durable, text_files
@@ -134,7 +134,8 @@ class StudyTable(SettingsTable):
         recorded = Counter((one.arena, one.recording) for one in self.sessions if one.arena)
         twice = first_twice(ids)
         named = first_twice(f"{one.animal} has two sessions {one.session}" for one in self.sessions)
-        wrong = [
+        refuse(
+            ValueError,
             (twice, f"the animal {twice} is listed twice; keep one"),
             (first_twice(arenas), "two [[arenas]] have the same name; give each its own"),
             *(
@@ -162,10 +163,7 @@ class StudyTable(SettingsTable):
                 for (arena, recording), n in recorded.items()
             ),
             (named, f"the animal {named}; give each its own name"),
-        ]
-        for is_wrong, sentence in wrong:
-            if is_wrong:
-                raise ValueError(sentence)
+        )
         return self
 
 

@@ -141,9 +141,7 @@ def _stretches(scene: Scene, sample: Depths) -> tuple[Rows, Rows, Rows, Rows]:
     n = len(sample)
     inner = cv2.erode(scene.on_floor.astype(np.uint8), np.ones((9, 9), np.uint8)).astype(bool)
     limit = np.where(inner, scene.background - np.float32(HIGH_MM), np.float32(0))
-    often = np.zeros(limit.shape, np.int64)
-    for depth in sample:
-        often += (depth > 0) & (depth < limit)
+    often = sum((depth > 0) & (depth < limit) for depth in sample)
     rows, columns = np.nonzero((often >= _LEAST_FRAMES) & (often <= n - _LEAST_FRAMES))
     readings = sample[:, rows, columns]
     read = readings > 0
