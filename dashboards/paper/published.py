@@ -61,7 +61,7 @@ DEVIATIONS = (
     "Further images, which no tree was grown on: 4,096 (mouse) and 2,048 (fish, hand) for the "
     "predicted error of the paper's variant, none for RF and CNN. Ours has 4,096 (fish) and 12,288 "
     "(mouse) for the correction of a pose, 4,096 (fish, hand) and 24,576 (mouse) for its predicted "
-    "error, and 49,152 (mouse) for telling head from tail.",
+    "error, and 49,152 (mouse) for its head-tail classifier.",
     "Trainings: three of the paper's variant and its ablations; one of ours, of RF and of CNN, so "
     "nothing shows how much of their numbers is the luck of one training.",
     "Clean, hard and other-body are no untouched tests of ours: they were inspected while it was "

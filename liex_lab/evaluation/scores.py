@@ -49,7 +49,7 @@ TRACKING_PROTOCOL = (
     "ratio_to_single and p95_ratio_to_single: over the frames in which this row and the single "
     "frames both have a pose. in_view_ratio and in_view_p95_ratio: over all frames in which at "
     "least half of the animal is visible; a frame without a pose counts as an error of half the "
-    "animal's length, for both, so that nobody gains by giving up frames. longest_flip_frames: "
+    "animal's length, for both, so that leaving out frames gains nothing. longest_flip_frames: "
     "most frames in a row whose base-to-tip direction is more than 90 degrees from the true one. "
     "interval90_coverage: share of joint coordinates within 1.645 sd of the truth. "
     "recovery_frames: after the end of an occlusion (the bar has passed, or less than half of the "

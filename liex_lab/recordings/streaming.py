@@ -149,7 +149,7 @@ def received(host: str, port: int) -> Arriving:
         link = socket.create_connection((host, port), timeout=_GREETING_S)
     except OSError as error:
         raise RecordingError(
-            f"nobody sends frames at {host}:{port} ({error}); start the sender first"
+            f"no sender answers at {host}:{port} ({error}); start the sender first"
         ) from None
     where = f"{host}:{port}"
     with closing_on_error(link):

@@ -70,7 +70,7 @@ def test_a_recording_that_grows_is_read_as_it_grows_and_over_when_nothing_comes(
 
 
 def test_where_nobody_sends_or_writes_that_is_said():
-    with pytest.raises(RecordingError, match="nobody sends frames"):
+    with pytest.raises(RecordingError, match="no sender answers"):
         received("127.0.0.1", 9)
 
     def nothing() -> Recording:

@@ -138,7 +138,7 @@ class OniFile:
             yield record
             if record.end >> 20 != reported:
                 reported = record.end >> 20
-                progress(reported, (self.size >> 20) + 1, "looking through the recording (MB)")
+                progress(reported, (self.size >> 20) + 1, "scanning the recording (MB)")
             record = following
         self.whole = self.whole and ended
 

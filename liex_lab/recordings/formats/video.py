@@ -66,7 +66,7 @@ class _Walk:
 
     def read(self, at: int, n: int) -> bytes:
         """Some bytes of the file; fewer at its end."""
-        self._progress(at >> 20, (self._size >> 20) + 1, "looking through the video (MB)")
+        self._progress(at >> 20, (self._size >> 20) + 1, "scanning the video (MB)")
         self._file.seek(at)
         return self._file.read(n)
 

@@ -133,7 +133,7 @@ def open_files(
     found: list[Probe] = []
     for path in files:
         found.append(probe(path))
-        progress(len(found), len(files), "looking at the images")
+        progress(len(found), len(files), "reading the images")
     sizes = {
         size: path.name for path, size in zip(files, found, strict=True) if isinstance(size, tuple)
     }
@@ -626,7 +626,7 @@ def open_tiffs(files: list[Path], progress: Progress) -> TiffStack:
             problems.append(f"{path.name} is cut short: only its first {n_whole} images are whole")
             found = found[:n_whole]
         pages += found or [_Page(path, 0)]
-        progress(number, len(files), "looking at the images")
+        progress(number, len(files), "reading the images")
     sizes = {page.size: page.path.name for page in reversed(pages) if page.whole}
     return TiffStack(pages, _common_size(sizes, files, "TIFF"), problems)
 

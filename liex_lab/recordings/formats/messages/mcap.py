@@ -196,7 +196,7 @@ class McapFile(MessageFile):
             progress(
                 min(at, self.size) >> 20,
                 (self.size >> 20) + 1,
-                "looking through the recording (MB)",
+                "scanning the recording (MB)",
             )
         self.whole = self.whole and footer and at + len(MAGIC) <= self.size
 
@@ -386,7 +386,7 @@ class IndexedMcap(McapFile):
                 n_messages += n_bytes // _ENTRY.itemsize
                 if wanted(self._by_id[channel_id]):
                     tables[channel_id].append((len(self.chunks) - 1, entries))
-            progress(end >> 20, (self.size >> 20) + 1, "looking through the recording (MB)")
+            progress(end >> 20, (self.size >> 20) + 1, "scanning the recording (MB)")
         if (n_messages, self.n_notes) != self._counted:
             raise DamagedChunk("there is more in the file than in its index")
         return tables

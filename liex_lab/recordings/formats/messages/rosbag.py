@@ -121,7 +121,7 @@ class BagFile(MessageFile):
             progress(
                 min(at, self.size) >> 20,
                 (self.size >> 20) + 1,
-                "looking through the recording (MB)",
+                "scanning the recording (MB)",
             )
         # Only an interrupted recording has no index at its end.
         self.whole = self.whole and at == self.size and indexed
@@ -270,7 +270,7 @@ class Db3File(MessageFile):
                 if wanted(channel):
                     place = MessagePlace(-1, number, 0)
                     yield Envelope(channel, int(log_time_ns), place, self._fetch(number))
-                progress(number, last, "looking through the recording (messages)")
+                progress(number, last, "scanning the recording (messages)")
         except (sqlite3.Error, KeyError, ValueError, TypeError, OverflowError):
             self.whole = False
 
