@@ -437,7 +437,7 @@ def with_value(method: Method, number: str, value: int) -> Method:
     if number == INITIAL_POSES:
         changed["top_k"] = min(value, method.top_k)
     for whole in part:
-        changed = {whole: replace(getattr(method, whole), **changed)}
+        changed = {whole: getattr(method, whole)._replace(**changed)}
     return replace(method, **changed)
 
 
