@@ -154,7 +154,7 @@ def _apply(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
     results = evidence.Results(origin, rows, found.flips)
     behaviour, facts = _behaviour(raw, log, found, results)
     written = behaviour.tables
-    if found.changed:
+    if len(found.turned) or len(found.moved):
         results.write_track(folder)
         facts["frames"] = results.counts()
     else:
@@ -206,7 +206,9 @@ def _behaviour(
     """
     rules, around = stated_by(raw)
     count = frame_count(results.rows.frame_index)
-    around = replace(around, seams=[int(count[row]) for row in found.seams])
+    # where a manual exchange of head and tail begins or ends
+    seams = ends_of((flip.start, flip.stop) for flip in found.flips if flip.source == HUMAN)
+    around = replace(around, seams=[int(count[row]) for row in seams])
     frames = results.rows.frames_table
     bouts = raw.bouts
     actions = dict(raw.metadata.get("actions") or {})
@@ -239,16 +241,6 @@ class CorrectedTrack:
     turned: Numbers
     moved: Numbers
     flips: tuple[Flip, ...]
-
-    @property
-    def seams(self) -> list[int]:
-        """Rows at which a manual exchange of head and tail begins or ends."""
-        return ends_of((flip.start, flip.stop) for flip in self.flips if flip.source == HUMAN)
-
-    @property
-    def changed(self) -> bool:
-        """Whether any pose differs from the measured one."""
-        return bool(len(self.turned) + len(self.moved))
 
 
 def corrected_track(session: Session, log: corrections.Log, skeleton: Skeleton) -> CorrectedTrack:

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from liex_lab.sessions.review import (
 
 from ..figures.animals import Array
 from .data import StudyData
-from .desk import Desk, Desks, Stretch, coloured_actions
+from .desk import Desk, Stretch, coloured_actions
 
 Correct = Callable[..., object]
 Report = Callable[[Path], object]
@@ -209,40 +209,40 @@ class Saver:
             self._changed.notify_all()
 
 
+@dataclass(frozen=True)
 class Clerk:
     """Answers the correction page: a session's data, and its corrections.
 
-    Args:
-        desks: the study's sessions.
+    Attributes:
+        desk: finds the desk of a session by its key.
         saver: saves the corrections; None accepts none.
     """
 
-    def __init__(self, desks: Desks, saver: Saver | None) -> None:
-        self._desks = desks
-        self._saver = saver
+    desk: Callable[[str], Desk]
+    saver: Saver | None
 
     def about(self, key: str) -> dict[str, Any]:
         """Facts about the session `key`; for a session without poses, the reason and no n."""
         try:
-            return {**self._desks.of(key).about(), "may_correct": self._saver is not None}
+            return {**self.desk(key).about(), "may_correct": self.saver is not None}
         except LiexError as error:
             return {"message": str(error)}
 
     def times(self, key: str) -> Response:
         """The frame times of the session `key`, s; empty without poses."""
         try:
-            return binary(self._desks.of(key).time_s)
+            return binary(self.desk(key).time_s)
         except LiexError:  # the page shows the reason
             return binary(np.zeros(0))
 
     def doubts(self, key: str) -> list[Stretch]:
         """The doubtful stretches of the session `key`: of poses, or with ?of=actions of actions."""
-        desk = self._desks.of(key)
+        desk = self.desk(key)
         return desk.suggested if request.args.get("of") == "actions" else desk.doubts()
 
     def frame(self, key: str, row: int) -> Response:
         """The part ?box=left,top,width,height of the frame in a `row` of the session `key`."""
-        return frame_part(self._desks.of(key), row, cached_s=3600)  # the address names the session
+        return frame_part(self.desk(key), row, cached_s=3600)  # the address names the session
 
     def state(self, key: str) -> dict[str, Any]:
         """The state of a session's corrections: unsaved, report, tickets, and the log.
@@ -250,16 +250,16 @@ class Clerk:
         Raises:
             SessionError: there is no such session.
         """
-        if self._saver is None:
+        if self.saver is None:
             return {"unsaved": 0, "report_old": False, "tickets": {}, "log": []}
-        desk = self._desks.of(key)
-        unsaved, old = self._saver.busy(desk.session.path)
+        desk = self.desk(key)
+        unsaved, old = self.saver.busy(desk.session.path)
         return {
             "unsaved": unsaved,
             "report_old": old,
             "tickets": {
                 str(n): {"state": one.state, "message": one.message, "number": one.number}
-                for n, one in self._saver.tickets(desk.session.path).items()
+                for n, one in self.saver.tickets(desk.session.path).items()
             },
             "log": desk.log(),
             "redo": desk.redo(),
@@ -277,10 +277,10 @@ class Clerk:
             LiexError: the request is invalid.
         """
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
-        saver = self._saver
+        saver = self.saver
         if saver is None or not isinstance(asked, dict):
             return {"message": "no correction is taken here"}, 403 if saver is None else 400
-        desk = self._desks.of(key)
+        desk = self.desk(key)
         folder = desk.session.path
         author = _text(asked, "by")
         if asked.get("undo"):
@@ -390,24 +390,25 @@ def frame_part(desk: Desk, row: int, cached_s: int) -> Response:
 # a clip's number; other labels are sent after the rater's last answer.
 
 
+@dataclass(frozen=True)
 class Reviews:
     """The reviews of a study, one file each.
 
-    Args:
+    Attributes:
         data: the study.
-        desks: its sessions.
+        desk: finds the desk of a session by its key.
         folder: of the review files.
+        lock: held while a file is written.
     """
 
-    def __init__(self, data: StudyData, desks: Desks, folder: Path) -> None:
-        self._data = data
-        self._desks = desks
-        self._folder = folder
-        self._lock = threading.Lock()
+    data: StudyData
+    desk: Callable[[str], Desk]
+    folder: Path
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
     def names(self) -> list[str]:
         """Names of the reviews."""
-        return list(review_names(self._folder))
+        return list(review_names(self.folder))
 
     def begin(self) -> dict[str, str]:
         """Resume the named review, or draw a new one; returns its name.
@@ -420,7 +421,7 @@ class Reviews:
         asked = _asked()
         name = checked_name(str(asked.get("name", "")), "a review")
         checked_name(str(asked.get("rater", "")), "a rater")
-        with self._lock:
+        with self.lock:
             if name not in self.names():
                 n, seed = (asked.get(key) for key in ("n", "seed"))
                 if type(n) is not int or type(seed) is not int or not 0 <= seed < 1 << 53:
@@ -430,7 +431,7 @@ class Reviews:
                 self._write(
                     drawn_review(
                         name,
-                        {entry.key: self._data.session(entry.key) for entry in self._data.done},
+                        {entry.key: self.data.session(entry.key) for entry in self.data.done},
                         n,
                         seed,
                     )
@@ -447,7 +448,7 @@ class Reviews:
         Raises:
             SessionError: there is no such review.
         """
-        review = read_review(self._folder, name)
+        review = read_review(self.folder, name)
         rater = checked_name(rater or request.args.get("rater", ""), "a rater")
         done = review.done_by(rater)
         return {
@@ -468,13 +469,13 @@ class Reviews:
         clip, word, rater = asked.get("clip"), asked.get("word"), str(asked.get("rater", ""))
         if type(clip) is not int or not isinstance(word, str):
             raise SessionError("an answer is the number of a clip and a word")
-        with self._lock:
-            self._write(read_review(self._folder, name).answered(rater, clip, word))
+        with self.lock:
+            self._write(read_review(self.folder, name).answered(rater, clip, word))
         return self.state(name, rater)
 
     def _write(self, review: Review) -> None:
         try:
-            write_review(self._folder, review)
+            write_review(self.folder, review)
         except OSError as error:
             raise SessionError(f"the review cannot be saved: {error}") from None
 
@@ -484,11 +485,11 @@ class Reviews:
         Raises:
             SessionError: there is no such clip.
         """
-        review = read_review(self._folder, name)
+        review = read_review(self.folder, name)
         if not 0 <= number < len(review.clips):
             raise SessionError(f"there is no clip {number}")
         clip = review.clips[number]
-        desk = self._desks.of(clip.session)
+        desk = self.desk(clip.session)
         first, stop = np.searchsorted(desk.time_s, [clip.start_s - 5e-4, clip.stop_s + 5e-4])
         return clip, desk, int(first), max(int(stop), int(first) + 1)
 

@@ -5,7 +5,7 @@ rows at a time, and one image at a time.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from liex_lab.sessions.correcting import disagreements
 from liex_lab.sessions.corrections import author_name, read_log
 from liex_lab.sessions.evidence import read_centres
 
-from ..figures.animals import Array, DepthImages, Recent, SessionAnimal
+from ..figures.animals import Array, DepthImages, SessionAnimal
 from ..report.contact_sheet import png
 from ..video.film import Footage
 from .tables import records
@@ -194,34 +194,6 @@ class Desk(Footage):
             raise SessionError(f"there is no part {list(box)} of a frame in row {row}")
         side = (right - left, low - top)
         return png(self.relief.image(self.depth(row), left, top, side, side), fast=True)
-
-
-class Desks:
-    """The desks of a study's sessions; a desk is replaced when its session changes.
-
-    Args:
-        find: opens a session by its key; returns the same object until its folder changes.
-        images: the depth images.
-        suggest: as of `Desk`.
-    """
-
-    def __init__(
-        self, find: Callable[[str], Session], images: DepthImages, suggest: Suggest | None = None
-    ) -> None:
-        self._find = find
-        self._images = images
-        self._suggest = suggest
-        # desks that stay in memory
-        self._kept = Recent(6)
-
-    def of(self, key: str) -> Desk:
-        """The desk of the session `key`.
-
-        Raises:
-            SessionError: there is no such session.
-        """
-        session = self._find(key)
-        return self._kept.get(key, id(session), partial(Desk, session, self._images, self._suggest))
 
 
 def coloured_actions(words: Sequence[str]) -> list[dict[str, str]]:

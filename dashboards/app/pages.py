@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 import pandas as pd
-from flask import Flask, Response, jsonify, redirect, render_template, request
+from flask import Flask, Response, jsonify, redirect, render_template, request, stream_with_context
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -55,7 +56,7 @@ from .data import (
     raster,
     shown_words,
 )
-from .desk import Desks
+from .desk import Desk
 from .tables import number, records, session_address
 
 ShowReplay = Callable[[Path, float], object]
@@ -81,30 +82,23 @@ _FACTS = (
 )
 
 
+@dataclass(frozen=True)
 class Pages:
     """The pages of a study, and what their scripts ask for.
 
-    Args:
+    Attributes:
         data: the study.
-        desks: its sessions.
+        desk: finds a session's data by its key.
         show_replay: opens the replay of a .rrd at a time (s); None only shows the command.
         may_correct: whether corrections are saved.
         of_recordings: whether regions can be drawn for recordings without results.
     """
 
-    def __init__(
-        self,
-        data: StudyData,
-        desks: Desks,
-        show_replay: ShowReplay | None,
-        may_correct: bool,
-        of_recordings: bool,
-    ) -> None:
-        self.data = data
-        self._desks = desks
-        self._show_replay = show_replay
-        self._may_correct = may_correct
-        self._of_recordings = of_recordings
+    data: StudyData
+    desk: Callable[[str], Desk]
+    show_replay: ShowReplay | None
+    may_correct: bool
+    of_recordings: bool
 
     def table(self, name: str, **how: Any) -> Markup:
         """A table as HTML, by its name; see `tables.find` and `tables.fill`."""
@@ -163,7 +157,7 @@ class Pages:
             return render_template("sentence.html", title="No such session", message=reason), 404
         if entry not in self.data.done:
             reason = "; ".join(filter(None, (entry.reason, entry.remedy)))
-            more = {"arena": f"/arena/{quote(key, safe='')}"} if self._of_recordings else {}
+            more = {"arena": f"/arena/{quote(key, safe='')}"} if self.of_recordings else {}
             what = {"kind": "session", "title": key, "state": entry.state}
             reason = reason or "it has not been measured yet"
             return render_template("sentence.html", message=reason, **what, **more)
@@ -172,8 +166,8 @@ class Pages:
             **session_facts(self.data, key),
             at_s=_moment(),
             steps=_STEPS,
-            may_show=self._show_replay is not None,
-            sentences=correcting.SENTENCES if self._may_correct else (),
+            may_show=self.show_replay is not None,
+            sentences=correcting.SENTENCES if self.may_correct else (),
             modules=sorted(
                 path.name for path in (Path(__file__).parent / "assets").glob("desk*.mjs")
             ),
@@ -181,11 +175,11 @@ class Pages:
 
     def whole(self, key: str) -> Response:
         """The ethogram and the curves of a session, or of its stretch from ?from= to ?to= (s)."""
-        span = _span(self._desks.of(key).animals[0].duration_s)
+        span = _span(self.desk(key).animals[0].duration_s)
         part = span if "from" in request.args else None
 
         def figures(_: Session) -> list[Figure | None]:
-            animals = self._desks.of(key).animals
+            animals = self.desk(key).animals
             return [draw(one, part) for one in animals for draw in (times.ethogram, times.curves)]
 
         with drawing():
@@ -197,7 +191,7 @@ class Pages:
         span = (at_s - _HALF_S, at_s + _HALF_S)
         with drawing():
             figure = self.data.read(
-                key, lambda _: times.curves(self._desks.of(key).animals[0], span, _AROUND_MM)
+                key, lambda _: times.curves(self.desk(key).animals[0], span, _AROUND_MM)
             )
             values = self.data.read(key, lambda session: facts(session, at_s))
             path = self.data.session(key).path
@@ -221,9 +215,9 @@ class Pages:
         """Open the replay of a session at a moment."""
         asked = request.get_json(silent=True)  # a form of another site cannot send JSON
         at_s = asked.get("at_s") if isinstance(asked, dict) else None
-        if self._show_replay is None or not isinstance(at_s, int | float):
+        if self.show_replay is None or not isinstance(at_s, int | float):
             return {"message": "no replay is opened here"}, 403
-        self._show_replay(self.data.session(key).path / "session.rrd", float(at_s))
+        self.show_replay(self.data.session(key).path / "session.rrd", float(at_s))
         return {"message": f"Rerun shows the replay at {at_s:.3f} s."}
 
     def figure(self, key: str, name: str) -> Response:
@@ -235,6 +229,31 @@ class Pages:
                 key, lambda session: next(sets.session_figures(session, [name]))
             )
             return _download(drawn)
+
+    def csv(self, name: str) -> Response:
+        """A table as shown, by its `name`, see `tables.find`."""
+        return _csv(lambda: tables.find(self.data, name).rows, name.replace("/", "_").strip("_"))
+
+    def session_csv(self, key: str, name: str) -> Response:
+        """The whole table `name` of the session `key`."""
+        return _csv(lambda: tables.session_table(self.data, key, name), f"{key}_{name}")
+
+    def report(self, key: str) -> Response:
+        """The report of the session `key`; its content policy allows no script."""
+        try:
+            folder = self.data.session(key).path.resolve()
+            file = (folder / "report.html").resolve()
+            if file.parent != folder:  # a link to another folder
+                raise FileNotFoundError(file)
+            page = file.read_text(encoding="utf-8")
+        except (LiexError, OSError, ValueError):
+            return Response("This session has no report.", 404, mimetype="text/plain")
+        answer = Response(page, mimetype="text/html")
+        # a report needs no script
+        answer.headers["Content-Security-Policy"] = (
+            "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+        )
+        return answer
 
 
 def add_handlers(app: Flask, pages: Pages) -> None:
@@ -554,3 +573,14 @@ def _span(duration_s: float) -> Span:
         return 0.0, stop_s
     low, high = max(low, 0.0), min(high, stop_s)
     return (low, high) if high - low > 1e-3 else (0.0, stop_s)
+
+
+def _csv(find: Callable[[], pd.DataFrame], name: str) -> Response:
+    try:
+        rows = find()
+    except LiexError as error:
+        return Response(str(error), 404, mimetype="text/plain")
+    safe = re.sub(r"[^A-Za-z0-9_-]", "_", name) or "table"
+    answer = Response(stream_with_context(tables.as_csv(rows)), mimetype="text/csv")
+    answer.headers["Content-Disposition"] = f'attachment; filename="{safe}.csv"'
+    return answer

@@ -7,19 +7,19 @@ and a message for the visitor.
 
 import hmac
 import logging
-import re
 import signal
 import socket
 import sys
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
 import numpy as np
-import pandas as pd
-from flask import Flask, Response, abort, redirect, request, stream_with_context
+from flask import Flask, Response, abort, redirect, request
 from jinja2 import StrictUndefined
 from numpy.typing import NDArray
 from waitress.server import create_server
@@ -31,26 +31,26 @@ from liex_lab.runtime.processes import Ended
 from liex_lab.scene.background import usual_depth
 from liex_lab.sessions import Session
 
-from ..figures.animals import DepthImages
+from ..figures.animals import DepthImages, Recent
 from ..report.contact_sheet import png, png_uri, scene_marks, shade, svg_marks
-from . import corrections, pages, tables
+from . import corrections, pages
 from .data import StudyData
-from .desk import Desks, Suggest
+from .desk import Desk, Suggest
 
 
+@dataclass(frozen=True)
 class Scenes:
     """Depth images and facts of scenes.
 
-    Args:
+    Attributes:
         data: the study.
         images: the depth images.
         regions: reads and writes the regions of recordings, see `make_app`; None writes none.
     """
 
-    def __init__(self, data: StudyData, images: DepthImages, regions: Any) -> None:
-        self._data = data
-        self._images = images
-        self._regions = regions
+    data: StudyData
+    images: DepthImages
+    regions: Any
 
     def about(self, key: str) -> dict[str, Any]:
         """Facts for the page: image size, marks, and where a region can be saved.
@@ -59,10 +59,10 @@ class Scenes:
             LiexError: there is no such recording, or it cannot be read.
         """
         session = self._session(key)
-        facts: dict[str, Any] = {"may_save": self._regions is not None, "places": []}
+        facts: dict[str, Any] = {"may_save": self.regions is not None, "places": []}
         facts["region"] = None
-        if self._regions is not None:
-            facts |= self._regions.about(key, session)
+        if self.regions is not None:
+            facts |= self.regions.about(key, session)
         camera = self._whole(key)[1] if session is None else session.camera
         marks = [] if session is None else scene_marks(session)
         found = [
@@ -81,12 +81,12 @@ class Scenes:
             LiexError: the region is invalid, or cannot be saved.
         """
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
-        if self._regions is None or not isinstance(asked, dict):
-            return {"message": "no region is saved here"}, 403 if self._regions is None else 400
+        if self.regions is None or not isinstance(asked, dict):
+            return {"message": "no region is saved here"}, 403 if self.regions is None else 400
         place = str(asked.get("place"))[:40]
         corners, was = asked.get("corners"), asked.get("was")
-        report = self._regions.save(key, self._session(key), place, corners, was)
-        self._data.refresh()
+        report = self.regions.save(key, self._session(key), place, corners, was)
+        self.data.refresh()
         return {**self.about(key), "saved": report}
 
     def image(self, key: str) -> Response:
@@ -108,28 +108,28 @@ class Scenes:
         Raises:
             SessionError: there is no such session.
         """
-        session = self._data.session(key)
+        session = self.data.session(key)
         return Response(scene_svg(session, self._usual(session)), mimetype="image/svg+xml")
 
     def _session(self, key: str) -> Session | None:
         """The results of the recording `key`; None if absent."""
-        if key not in self._data.entries:
+        if key not in self.data.entries:
             raise SessionError(f"there is no recording '{key}'; see the list of sessions")
-        return self._data.session(key) if key in {one.key for one in self._data.done} else None
+        return self.data.session(key) if key in {one.key for one in self.data.done} else None
 
     def _usual(self, session: Session) -> NDArray[np.uint16]:
         """(H, W) uint16 mm: the usual depth of the session's frames."""
         n = len(session.frames)
         # at most nine frames, for each pixel's usual depth
         rows = np.unique(np.linspace(0, n - 1, min(n, 9)).astype(int))
-        depths = [self._images.depth(session, int(row)) for row in rows]
+        depths = [self.images.depth(session, int(row)) for row in rows]
         empty = np.zeros((session.camera.height, session.camera.width), np.uint16)
         return usual_depth(np.stack([one for one in depths if one is not None] or [empty]))
 
     def _whole(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
-        if self._regions is None:
+        if self.regions is None:
             raise SessionError(f"{key} was not measured yet, so there is no image of it")
-        return self._regions.depth_image(key)
+        return self.regions.depth_image(key)
 
 
 def scene_svg(session: Session, depth: NDArray[np.uint16]) -> str:
@@ -154,7 +154,6 @@ def _shaded(depth: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return shade(depth, max(reach, 60.0))  # the least range, mm
 
 
-Views = dict[str, Callable[..., Any]]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MOST_BYTES = 4 << 20  # of a request's body; a correction has a few hundred bytes
 _SAVER = "liex_saver"
@@ -209,36 +208,21 @@ def make_app(
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
     guard(app, token, alone=alone)
     images = DepthImages()
-    desks = Desks(data.session, images, suggest)
+    kept = Recent(6)  # desks that stay in memory
+
+    def desk_of(key: str) -> Desk:
+        """The desk of a session, another one when the session changes."""
+        session = data.session(key)
+        return kept.get(key, id(session), partial(Desk, session, images, suggest))
+
     saver = corrections.Saver(correct, report) if correct is not None else None
     app.extensions[_SAVER] = saver
     of_recordings = regions is not None and regions.of_recordings
-    shown = pages.Pages(data, desks, show_replay, saver is not None, of_recordings)
+    shown = pages.Pages(data, desk_of, show_replay, saver is not None, of_recordings)
     pages.add_handlers(app, shown)
-    views = _views(
-        shown,
-        corrections.Clerk(desks, saver),
-        desks,
-        Scenes(data, images, regions),
-        Downloads(data),
-    )
-    if reviews is not None:
-        views |= _review_views(corrections.Reviews(data, desks, reviews))
-    for rule, view in views.items():
-        method, path = rule.split(" ")
-        app.add_url_rule(path, rule.replace(".", "-"), view, methods=[method])
-    return app
-
-
-def _views(
-    shown: pages.Pages,
-    clerk: corrections.Clerk,
-    desks: Desks,
-    scenes: Scenes,
-    downloads: "Downloads",
-) -> Views:
-    """Every address of the dashboard, and what answers it."""
-    return {
+    clerk = corrections.Clerk(desk_of, saver)
+    scenes = Scenes(data, images, regions)
+    views: dict[str, Callable[..., Any]] = {
         "GET /": shown.sessions,
         "POST /refresh": shown.refresh,
         "GET /table": shown.requested_table,
@@ -253,17 +237,17 @@ def _views(
         "GET /step/<path:key>": shown.step,
         "POST /replay/<path:key>": shown.replay,
         "GET /figure/<path:key>/<name>.svg": shown.figure,
-        "GET /csv/<path:name>.csv": downloads.table,
-        "GET /session-csv/<path:key>/<name>.csv": downloads.session_table,
-        "GET /report/<path:key>": downloads.report,
+        "GET /csv/<path:name>.csv": shown.csv,
+        "GET /session-csv/<path:key>/<name>.csv": shown.session_csv,
+        "GET /report/<path:key>": shown.report,
         "GET /desk/<path:key>/about": clerk.about,
         "GET /desk/<path:key>/times": clerk.times,
-        "GET /desk/<path:key>/rows/<int:first>/<int:stop>": lambda key, first, stop: desks.of(
+        "GET /desk/<path:key>/rows/<int:first>/<int:stop>": lambda key, first, stop: desk_of(
             key
         ).rows(first, stop),
-        "GET /desk/<path:key>/bouts": lambda key: desks.of(key).bouts(),
+        "GET /desk/<path:key>/bouts": lambda key: desk_of(key).bouts(),
         "GET /desk/<path:key>/doubts": clerk.doubts,
-        "GET /desk/<path:key>/crossings": lambda key: desks.of(key).crossings(),
+        "GET /desk/<path:key>/crossings": lambda key: desk_of(key).crossings(),
         "GET /desk/<path:key>/frame/<int:row>.png": clerk.frame,
         "GET /desk/<path:key>/state": clerk.state,
         "POST /desk/<path:key>/correct": clerk.correct,
@@ -272,21 +256,23 @@ def _views(
         "GET /region/<path:key>/scene.svg": scenes.scene,
         "POST /region/<path:key>/save": scenes.save,
     }
-
-
-def _review_views(reviews: corrections.Reviews) -> Views:
-    """Every address of the blinded reviews, and what answers it."""
-    clip = "GET /reviews/<path:name>/clip/<int:number>"
-    return {
-        "GET /reviews": reviews.names,
-        "POST /reviews": reviews.begin,
-        "GET /reviews/<path:name>/state": reviews.state,
-        "POST /reviews/<path:name>/answer": reviews.answer,
-        f"{clip}/about": reviews.about,
-        f"{clip}/times": reviews.times,
-        f"{clip}/rows/<int:start>/<int:end>": reviews.rows,
-        f"{clip}/frame/<int:row>.png": reviews.frame,
-    }
+    if reviews is not None:
+        raters = corrections.Reviews(data, desk_of, reviews)
+        clip = "GET /reviews/<path:name>/clip/<int:number>"
+        views |= {
+            "GET /reviews": raters.names,
+            "POST /reviews": raters.begin,
+            "GET /reviews/<path:name>/state": raters.state,
+            "POST /reviews/<path:name>/answer": raters.answer,
+            f"{clip}/about": raters.about,
+            f"{clip}/times": raters.times,
+            f"{clip}/rows/<int:start>/<int:end>": raters.rows,
+            f"{clip}/frame/<int:row>.png": raters.frame,
+        }
+    for rule, view in views.items():
+        method, path = rule.split(" ")
+        app.add_url_rule(path, rule.replace(".", "-"), view, methods=[method])
+    return app
 
 
 def serve(app: Flask, host: str, port: int, report: Callable[[int], object]) -> None:
@@ -440,46 +426,3 @@ def _site(address: str, name: bool = False) -> str | None:
         return found.hostname if name else found.netloc
     except ValueError:
         return None
-
-
-class Downloads:
-    """Tables as CSV, and sessions' reports."""
-
-    def __init__(self, data: StudyData) -> None:
-        self._data = data
-
-    def table(self, name: str) -> Response:
-        """A table as shown, by its `name`, see `tables.find`."""
-        return _csv(lambda: tables.find(self._data, name).rows, name.replace("/", "_").strip("_"))
-
-    def session_table(self, key: str, name: str) -> Response:
-        """The whole table `name` of the session `key`."""
-        return _csv(lambda: tables.session_table(self._data, key, name), f"{key}_{name}")
-
-    def report(self, key: str) -> Response:
-        """The report of the session `key`; its content policy allows no script."""
-        try:
-            folder = self._data.session(key).path.resolve()
-            file = (folder / "report.html").resolve()
-            if file.parent != folder:  # a link to another folder
-                raise FileNotFoundError(file)
-            page = file.read_text(encoding="utf-8")
-        except (LiexError, OSError, ValueError):
-            return Response("This session has no report.", 404, mimetype="text/plain")
-        answer = Response(page, mimetype="text/html")
-        # a report needs no script
-        answer.headers["Content-Security-Policy"] = (
-            "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
-        )
-        return answer
-
-
-def _csv(find: Callable[[], pd.DataFrame], name: str) -> Response:
-    try:
-        rows = find()
-    except LiexError as error:
-        return Response(str(error), 404, mimetype="text/plain")
-    safe = re.sub(r"[^A-Za-z0-9_-]", "_", name) or "table"
-    answer = Response(stream_with_context(tables.as_csv(rows)), mimetype="text/csv")
-    answer.headers["Content-Disposition"] = f'attachment; filename="{safe}.csv"'
-    return answer

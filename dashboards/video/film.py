@@ -150,16 +150,11 @@ def _enlarged(mask: NDArray[np.bool_], size: tuple[int, int]) -> NDArray[np.bool
     )
 
 
-@lru_cache(maxsize=8)
-def _font(size: int) -> Any:
-    """The font of matplotlib, which is the same on every machine."""
-    return ImageFont.truetype(findfont("DejaVu Sans"), size)
-
-
 @lru_cache(maxsize=512)
 def _stencil(text: str, size: int) -> NDArray[np.float32]:
     """The coverage of each pixel by a text, 0 to 1."""
-    font = _font(size)
+    # the font of matplotlib, which is the same on every machine
+    font = ImageFont.truetype(findfont("DejaVu Sans"), size)
     left, _, right, bottom = font.getbbox(text)
     image = Image.new("L", (max(int(right - min(left, 0)), 1), max(int(bottom), 1)))
     ImageDraw.Draw(image).text((-min(left, 0), 0), text, font=font, fill=255)

@@ -21,6 +21,8 @@ import subprocess
 import tarfile
 import tempfile
 import time
+import timeit
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
@@ -104,12 +106,7 @@ print(json.dumps(facts | (found if isinstance(found, dict) else {})))
 def best_seconds(job: Callable[[], Any], n_repeats: int = 5) -> float:
     """Shortest time, s, of several runs after one that compiles: the least disturbed one."""
     job()
-    times = []
-    for _ in range(n_repeats):
-        began = time.perf_counter()
-        job()
-        times.append(time.perf_counter() - began)
-    return min(times)
+    return min(timeit.repeat(job, number=1, repeat=n_repeats))
 
 
 def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str, Any]:
@@ -297,8 +294,7 @@ def _one_by_one(paper: PoseEstimator, footage: SpeedSample) -> NDArray[Any]:
         scale.ravel(),
         np.ones(n * k),
     )
-    for _ in cascade.steps(images, poses):
-        pass
+    deque(cascade.steps(images, poses), 0)
     return cascade.predict(paper.model.metric, cascade.metric_samples(images, poses))
 
 
@@ -594,13 +590,8 @@ def read_all(path: str, n_repeats: int) -> dict[str, float]:
     began = time.perf_counter()
     with open_recording(path, strict=True) as recording:
         opened_s = time.perf_counter() - began
-        seconds = []
         recording.frame(0)  # loading and compilation for the first frame do not count
-        for _ in range(n_repeats):
-            began = time.perf_counter()
-            for _frame in recording:
-                pass
-            seconds.append(time.perf_counter() - began)
+        seconds = timeit.repeat(lambda: deque(recording, 0), number=1, repeat=n_repeats)
         return {
             "frames_per_s": len(recording) / min(seconds),
             "open_ms_per_frame": 1000.0 * opened_s / len(recording),

@@ -158,7 +158,7 @@ def acted(
         group = [scenarios[k] for k in rows]
         animal = group[0].animal
         key = hashlib.sha256((repr(group) + made_by).encode() + _generator(animal)).hexdigest()[:16]
-        path = cache_folder() / "acted" / f"{animal}-seen-{key}.npz"
+        path = cache_folder() / "acted" / f"{animal}-observed-{key}.npz"
         if not path.is_file():
             sizes: dict[int, float] = {}
             measured: list[AgentTrack] = []
@@ -312,50 +312,54 @@ def _generator(animal: str) -> bytes:
 
 
 def _save(path: Path, group: list[AgentTrack]) -> None:
-    subjects = [one.subject for one in group]
-    columns: dict[str, Any] = {
-        "lengths": [len(one.words) for one in group],
-        "animals": [one.animal for one in group],
-        "camera": [
-            [getattr(one.camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")]
-            for one in subjects
-        ],
-        "camera_turn": [one.T_arena_camera.rotation for one in subjects],
-        "camera_shift": [one.T_arena_camera.translation for one in subjects],
-        "sizes": [one.subject.length_mm / one.observations.skeleton.length for one in group],
-    }
-    for name in ("words", "wall_mm", "truth"):
-        columns[name] = np.concatenate([getattr(one, name) for one in group])
-    for name in COLUMNS:
-        values = np.concatenate([getattr(one.observations, name) for one in group])
-        # without the hypotheses of a second object in view
-        columns[name] = values if values.ndim == 1 else values[:, :2]
+    columns: dict[str, Any] = {}
+    for k, one in enumerate(group):
+        camera = one.subject.camera
+        known = {name: getattr(one.observations, name) for name in COLUMNS} | {
+            "truth": one.truth,
+            "words": one.words,
+            "wall_mm": one.wall_mm,
+            "animal": one.animal,
+            "lens": [camera.fx, camera.fy, camera.cx, camera.cy],
+            "pixels": [camera.width, camera.height],
+            "turn": one.subject.T_arena_camera.rotation,
+            "shift": one.subject.T_arena_camera.translation,
+            "size": one.subject.length_mm / one.observations.skeleton.length,
+        }
+        columns |= {f"{name} {k}": value for name, value in known.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as part:
         np.savez(part, **columns)
 
 
 def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> list[AgentTrack]:
-    with np.load(path) as kept:
-        data = dict(kept)
     tracker = PatchObserver(estimator)
-    stops = np.cumsum(data["lengths"])
     found = []
-    for k, scenario in enumerate(group):
-        part = slice(stops[k] - data["lengths"][k], stops[k])
-        camera = Camera(*data["camera"][k, :4], *(int(x) for x in data["camera"][k, 4:]))
-        T_arena_camera = SE3(data["camera_turn"][k], data["camera_shift"][k])
-        found.append(
-            AgentTrack(
-                Observations(estimator.skeleton, *(data[name][part] for name in COLUMNS)),
-                tracker.subject(camera, T_arena_camera, float(data["sizes"][k])),
-                data["words"][part],
-                str(data["animals"][k]),
-                data["wall_mm"][part],
-                data["truth"][part],
-                scenario.word,
+    with np.load(path) as data:
+        for k, scenario in enumerate(group):
+            # without the hypotheses of a second object in view
+            observed = (data[f"{name} {k}"] for name in COLUMNS)
+            lens, pixels, turn, shift, size, words, animal, wall_mm, truth = (
+                data[f"{name} {k}"]
+                for name in (
+                    *("lens", "pixels", "turn", "shift", "size"),
+                    *("words", "animal", "wall_mm", "truth"),
+                )
             )
-        )
+            found.append(
+                AgentTrack(
+                    Observations(
+                        estimator.skeleton,
+                        *(values if values.ndim == 1 else values[:, :2] for values in observed),
+                    ),
+                    tracker.subject(Camera(*lens, *pixels.tolist()), SE3(turn, shift), float(size)),
+                    words,
+                    str(animal),
+                    wall_mm,
+                    truth,
+                    scenario.word,
+                )
+            )
     return found
 
 

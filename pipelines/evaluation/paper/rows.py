@@ -24,7 +24,6 @@ from liex_lab.baselines.baseline import (
     second_is_likelier,
 )
 from liex_lab.body.skeleton import Array, Skeleton
-from liex_lab.errors import PlanError
 from liex_lab.estimation.cascade import N_DIRECTIONS, Candidates, Cascade, TrainingSet
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import Method, method_of
@@ -77,17 +76,11 @@ def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subj
 
 
 def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subject]:
-    """The runs of a row of the paper's variant, from one estimator per training draw.
-
-    Raises:
-        PlanError: there is no such row.
-    """
+    """The runs of a row of the paper's variant, from one estimator per training draw."""
     if variant == "paper":
         return list(models)
     if variant == "paper-no-metric":
         return [PlainMean(one) for one in models]
-    if variant != "paper-one-pose":
-        raise PlanError(f"'{variant}' is no row of the paper's variant")
     return [
         PoseEstimator(one.model, 1, start_seed=START_DRAWS * k + draw)
         for k, one in enumerate(models)

@@ -212,18 +212,16 @@ def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
     path = (folder or kept_results_folder()) / f"{animal}.json"
     if not path.is_file():
         return {"rows": {}, "sensitivity": {}}
-    advice = "restore it from the repository, or measure every row with --fresh"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        schema = content["schema"]
-        kept = {part: dict(content[part]) for part in ("rows", "sensitivity")}
+        if content["schema"] != SCHEMA:
+            raise ValueError(f"its schema is {content['schema']}")
+        return {part: dict(content[part]) for part in ("rows", "sensitivity")}
     except (ValueError, TypeError, KeyError) as error:
         raise LiexError(
-            f"{path} should contain kept results as JSON, but is damaged ({error}); {advice}"
+            f"{path} should contain kept results of schema {SCHEMA} as JSON, but does not "
+            f"({error}); restore it from the repository, or measure every row with --fresh"
         ) from None
-    if schema != SCHEMA:
-        raise LiexError(f"{path} has kept results of schema {schema}, not {SCHEMA}; {advice}")
-    return kept
 
 
 def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
@@ -234,8 +232,11 @@ def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{results['animal']}.json"
-    kept, curves = (
-        {name: _lasting(entry) for name, entry in results[part].items()}
+    kept, curves = (  # without the entries that hold for a single run
+        {
+            name: {k: v for k, v in entry.items() if k not in ("origin", "other_processor")}
+            for name, entry in results[part].items()
+        }
         for part in ("rows", "sensitivity")
     )
     content = {
@@ -255,11 +256,6 @@ def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:
         encoding="utf-8",
     )
     return path
-
-
-def _lasting(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """A row or curve without the entries that hold for a single run."""
-    return {k: v for k, v in entry.items() if k not in ("origin", "other_processor")}
 
 
 def _rounded(value: Any) -> Any:
