@@ -146,22 +146,22 @@ def _measure(
         with closing(read_ahead(shared, min(done.values()))) as chunks:
             for frames in chunks:
                 for name, prepared in going.items():
-                    left = [frame for frame in frames if frame.index >= done[name]]
+                    left = [  # all pixels outside the arena's region unread
+                        DepthFrame(
+                            frame.index,
+                            frame.time_ns,
+                            np.where(within[name], frame.depth, np.float32(0)),
+                        )
+                        for frame in frames
+                        if frame.index >= done[name]
+                    ]
                     if left:
-                        prepared.measure(_cut_out(left, within[name]), writers[name])
+                        prepared.measure(left, writers[name])
                 progress(frames[-1].index + 1, len(shared), MEASURING)
         return {
             name: prepared.finish(writers[name], recording, notes).path
             for name, prepared in going.items()
         }
-
-
-def _cut_out(frames: Sequence[DepthFrame], inside: NDArray[np.bool_]) -> list[DepthFrame]:
-    """The frames with all pixels outside an arena's region unread."""
-    return [
-        DepthFrame(frame.index, frame.time_ns, np.where(inside, frame.depth, np.float32(0)))
-        for frame in frames
-    ]
 
 
 def arena_settings(arena: sections.SeveralArenas, name: str) -> tuple[str, ...]:

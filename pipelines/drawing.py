@@ -52,7 +52,10 @@ def draw_figures(
     """
     path = Path(place)
     folder = path if path.is_dir() else path.parent
-    sets.check_kinds(formats)
+    if unknown := [kind for kind in formats if kind not in sets.KINDS]:
+        raise SessionError(
+            f"figures are written as {', '.join(sets.KINDS)}, got '{unknown[0]}'; name one of these"
+        )
     if (path / "session.json").is_file():
         sets.check_names(only, list(sets.OF_SESSION))
         drawn = sets.session_figures(Session.open(path), only)

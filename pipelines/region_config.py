@@ -240,7 +240,16 @@ class StatedRegions:
                 _ = Study.from_table(text_files.parse_toml(text), found.file).sessions
             else:
                 Plan.from_toml(text, found.file.name)
-            _write(found.file, text)
+            try:
+                with durable.replacing(found.file) as part:
+                    part.write_bytes(text.encode("utf-8"))
+                    if found.file.is_file():
+                        shutil.copymode(found.file, part)
+            except OSError as error:
+                raise PlanError(
+                    f"{found.file} cannot be written ({error.strerror or one_line(error)}); put "
+                    "the lines below into it yourself, or free the place"
+                ) from None
         done = "states this region" if value is not None else "states no region any more"
         command = f"liex run {self._recording(key, session)} --plan {shlex.quote(str(found.file))}"
         if self._study is not None:
@@ -394,21 +403,3 @@ def _table(file: Path) -> dict[str, Any]:
         return text_files.read_toml(file)
     except (OSError, ValueError) as error:
         raise PlanError(f"{file.name} cannot be read as a plan ({one_line(error)})") from None
-
-
-def _write(file: Path, text: str) -> None:
-    """Replace the file as a whole, with its permissions kept.
-
-    Raises:
-        PlanError: it cannot be written.
-    """
-    try:
-        with durable.replacing(file) as part:
-            part.write_bytes(text.encode("utf-8"))
-            if file.is_file():
-                shutil.copymode(file, part)
-    except OSError as error:
-        raise PlanError(
-            f"{file} cannot be written ({error.strerror or one_line(error)}); put the lines below "
-            "into it yourself, or free the place"
-        ) from None

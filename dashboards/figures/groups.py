@@ -404,13 +404,17 @@ def _occupancies(
     """Each subject's first session and its occupancy on a common grid, by group."""
     corners = np.array([extent_mm(one.session, one.xy_mm, centred=True) for one in animals])
     low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
-
-    def framed(animal: SessionAnimal) -> Occupancy:
-        return occupancy(aligned(animal.session, animal.xy_mm), animal.hold_s, low, high)
-
     return {
         group: {
-            subject: (sessions[0].session, _added([framed(animal) for animal in sessions]))
+            subject: (
+                sessions[0].session,
+                _added(
+                    [
+                        occupancy(aligned(one.session, one.xy_mm), one.hold_s, low, high)
+                        for one in sessions
+                    ]
+                ),
+            )
             for subject, sessions in subjects.items()
         }
         for group, subjects in by_group(animals).items()

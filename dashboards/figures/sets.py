@@ -261,18 +261,6 @@ def check_names(only: Sequence[str], known: Sequence[str]) -> None:
         raise SessionError(f"there is no figure '{name}' here: {hint}known are {', '.join(known)}")
 
 
-def check_kinds(kinds: Sequence[str]) -> None:
-    """Refuse unknown formats of figures.
-
-    Raises:
-        SessionError: a format is unknown.
-    """
-    if unknown := [kind for kind in kinds if kind not in KINDS]:
-        raise SessionError(
-            f"figures are written as {', '.join(KINDS)}, got '{unknown[0]}'; name one of these"
-        )
-
-
 def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     """Every figure of a session as an element of a page, by name; also written as SVG.
 

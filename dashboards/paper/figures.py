@@ -534,9 +534,10 @@ def draw_scene(
         read = depth[depth > 0]
         low, high = np.quantile(read, [0.01, 0.99]) if len(read) else (0.0, 1.0)
         shown = [(truth.joints_camera[frame], _GREEN, 2.2) for truth in truths]
-        for one in individuals:
-            colour = "#AA3377" if one.trusted[frame] else "#EE7733"
-            shown.append((one.joints_camera[frame], colour, 1.2))
+        shown += [
+            (one.joints_camera[frame], "#AA3377" if one.trusted[frame] else "#EE7733", 1.2)
+            for one in individuals
+        ]
         for panel in (whole, near):
             _depth(panel, depth, low, high, "viridis_r")
             panel.set_facecolor("black")

@@ -54,21 +54,17 @@ def scene_marks(session: Session) -> list[Mark]:
     region = Mark("region", np.array(scene.get("region_px") or np.empty((0, 2)), float))
     outline = Mark("outline", in_image(session, session.arena.outline_mm()))
     made = [mark for mark in (region, outline) if len(mark.points_px) >= 3]
-    for fixture in map(Fixture.from_dict, scene.get("fixtures") or []):
-        made.append(
-            Mark(
-                "fixture",
-                in_image(session, np.array([fixture.centre_mm]), fixture.height_mm),
-                str(fixture),
-            )
-        )
+    made += [
+        Mark("fixture", in_image(session, np.array([one.centre_mm]), one.height_mm), str(one))
+        for one in map(Fixture.from_dict, scene.get("fixtures") or [])
+    ]
     hidden = hidden_places(session)
     # the 24 longest ones
     longest = np.argsort(hidden[:, 2] - hidden[:, 3], kind="stable")[:24]
-    for x, y, start, stop in hidden[np.sort(longest)]:
-        made.append(
-            Mark("hidden", in_image(session, np.array([[x, y]])), f"{start:.1f} to {stop:.1f} s")
-        )
+    made += [
+        Mark("hidden", in_image(session, np.array([[x, y]])), f"{start:.1f} to {stop:.1f} s")
+        for x, y, start, stop in hidden[np.sort(longest)]
+    ]
     return [mark for mark in made if len(mark.points_px)]
 
 

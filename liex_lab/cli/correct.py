@@ -134,18 +134,16 @@ def list_corrections(session: SessionPath) -> None:
         echo(f"{opened.path} has no corrections")
         return
     standing = {entry.number for entry in log.standing}
-    rows = []
-    for entry in log.entries:
-        what = f"{entry.undoes} taken back" if entry.what is None else entry.what
-        rows.append(
-            (
-                entry.number,
-                what,
-                entry.author,
-                entry.made_at,
-                "" if entry.what is None or entry.number in standing else "taken back",
-            )
+    rows = [
+        (
+            entry.number,
+            f"{entry.undoes} taken back" if entry.what is None else entry.what,
+            entry.author,
+            entry.made_at,
+            "" if entry.what is None or entry.number in standing else "taken back",
         )
+        for entry in log.entries
+    ]
     print_table(rows, "", "what", "by", "at", "")
     if log.standing and not applies(log, opened.path, opened.metadata):
         echo(

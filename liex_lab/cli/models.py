@@ -481,14 +481,7 @@ def evaluate_report(
     return api.evaluate_report(session, minutes, progress=progress)
 
 
-def show_hands(result: Result) -> None:
-    """Print one line for each method."""
-    from liex_lab.pipelines.evaluation import nyu
-
-    print_numbers(nyu.in_short(result))
-
-
-@benchmark("nyu", show_hands)
+@benchmark("nyu", lambda result: print_numbers(api.hands_in_short(result)))
 def evaluate_nyu(
     reference: Annotated[
         Path,
@@ -506,14 +499,7 @@ def evaluate_nyu(
     return api.evaluate_nyu(reference, model=model, progress=progress)
 
 
-def show_motion(result: Result) -> None:
-    """Print one measure per row."""
-    from liex_lab.pipelines.evaluation import motion
-
-    print_rows(motion.in_short(result))
-
-
-@benchmark("motion", show_motion)
+@benchmark("motion", lambda result: print_rows(api.motion_in_short(result)))
 def evaluate_motion(
     reference: Annotated[
         Path,

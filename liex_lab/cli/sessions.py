@@ -8,6 +8,7 @@ import socket
 import subprocess
 import tempfile
 import webbrowser
+from collections import Counter
 from contextlib import ExitStack
 from html import escape
 from math import isnan
@@ -569,9 +570,8 @@ def _print_study(standings: list[SessionStatus], all_of_them: bool) -> int:
     """
     from liex_lab.pipelines.study.status import to_check
 
-    counts: dict[str, int] = {}
+    counts = Counter(one.in_words for one in standings)
     for one in standings:
-        counts[one.in_words] = counts.get(one.in_words, 0) + 1
         if one.missing:
             gone = (
                 f"there is no recording {one.session.recording}; correct its path, or copy it there"
@@ -589,4 +589,4 @@ def _print_study(standings: list[SessionStatus], all_of_them: bool) -> int:
         f"{len(standings)} session{'' if len(standings) == 1 else 's'}: "
         + ", ".join(f"{n} {state}" for state, n in sorted(counts.items()))
     )
-    return counts.get("failed", 0) + counts.get("recording missing", 0)
+    return counts["failed"] + counts["recording missing"]

@@ -144,12 +144,14 @@ def motion_figures(real: PointMotion, virtual: dict[str, PointMotion]) -> dict[s
         }
         for measure in own
     }
-    outside = {}
-    for name, shown in others.items():
-        bounds = {m: np.quantile(shown[m], (0.005, 0.995)) for m in POSTURE}
-        outside[name] = {
-            m: float(((own[m] < low) | (own[m] > high)).mean()) for m, (low, high) in bounds.items()
+    outside = {
+        name: {
+            m: float(((own[m] < low) | (own[m] > high)).mean())
+            for m in POSTURE
+            for low, high in (np.quantile(shown[m], (0.005, 0.995)),)
         }
+        for name, shown in others.items()
+    }
     return {
         "n_frames": {"real": len(real.points_mm)}
         | {name: len(one.points_mm) for name, one in virtual.items()},
@@ -238,7 +240,7 @@ def evaluate_motion(
     return {"above": above, **motion_figures(real, virtual)}
 
 
-def in_short(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
+def motion_in_short(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The result of `evaluate_motion` as rows of a table, one measure per row."""
     rows = {}
     for measure, of in result["quantiles"].items():

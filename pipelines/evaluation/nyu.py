@@ -197,7 +197,7 @@ def frame_numbers_in(folder: Path, n_labelled: int) -> Numbers:
     return numbers
 
 
-def in_short(result: dict[str, Any]) -> dict[str, str]:
+def hands_in_short(result: dict[str, Any]) -> dict[str, str]:
     """One line for each method, and the protocol, from the result of `evaluate_nyu`."""
     lines = {}
     for name, row in [*result["published"].items(), (_OURS, result["ours"])]:

@@ -192,11 +192,14 @@ class Crew:
             report: called with id, pieces done, pieces in total, and the current step.
             finished: called with each result as it arrives.
         """
-
-        def unobserved(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
-            return about(session) | {"failure": failure}
-
-        return self._each(sessions, inspect, INSPECTING, unobserved, report, finished)
+        return self._each(
+            sessions,
+            inspect,
+            INSPECTING,
+            lambda session, failure: about(session) | {"failure": failure},
+            report,
+            finished,
+        )
 
     def _each(
         self,
