@@ -187,7 +187,7 @@ def test_zones_are_drawn_in_a_file_that_the_plan_names(walk, walked, tmp_path):
 
 
 def test_an_error_in_the_zones_is_raised_before_any_work(walk, tmp_path, monkeypatch):
-    learn = "liex_lab.pipelines.build.learn_scene"
+    learn = "liex_lab.scene.learning.learn_scene"
     monkeypatch.setattr(learn, lambda *_: pytest.fail("work was begun"))
     plan = MOUSE.with_settings([f"arena.zones={tmp_path / 'none.toml'}"])
     with pytest.raises(PlanError, match=r"there is no file .*none\.toml"):
