@@ -22,8 +22,7 @@ from liex_lab.plan.plan import toml_value
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import unwritable_times
-from liex_lab.runtime import processes
-from liex_lab.runtime.durable import inside
+from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, reporting_compilation, silent
 from liex_lab.scene.zones import masks_apart
 
@@ -100,7 +99,7 @@ def run_arenas(
         corners = {one.name: stated_corners(shared, first, one.region) for one in arenas}
         within = masks_apart(corners, opened.width, opened.height)
         names = [f"{first.session.name or opened.name}-{one.name}" for one in arenas]
-        folders = [inside(Path(out), name, ".liex") for name in names]
+        folders = [durable.inside(Path(out), name, ".liex") for name in names]
         for folder in folders:
             check_unused(folder, overwrite)
         going: dict[str, Prepared] = {}

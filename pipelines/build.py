@@ -25,10 +25,15 @@ from liex_lab.plan import Plan, known_plans, sections
 from liex_lab.recordings import depth_kernels, frame, open_recording, rectify
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene import background_segmenter, hand_segmenter, height_maps, support_plane
-from liex_lab.scene.background import sample_frames, sampled_scene, stride_for
+from liex_lab.scene import (
+    background,
+    background_segmenter,
+    hand_segmenter,
+    height_maps,
+    learning,
+    support_plane,
+)
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.learning import learn_scene
 from liex_lab.scene.scene import UNKNOWN, Arena, find_arena, plane_of
 from liex_lab.scene.zones import Corners, DrawnZone, Zone, read_zones, region_corners_px
 from liex_lab.sessions import Provenance, cutouts
@@ -239,9 +244,9 @@ def _floor_of_image(recording: Recording, plan: Plan) -> Floor:
 
 def _sampled(recording: Recording, plan: Plan) -> tuple[support_plane.SampledScene, int]:
     """Frames spread over a recording with their background, and the stride of their pixels."""
-    stride = stride_for(recording, animal_of(plan).spine_min_mm)
-    sample = sample_frames(recording, 96, stride)
-    return sampled_scene(sample, recording.camera.every(stride), target_of(plan)), stride
+    stride = background.stride_for(recording, animal_of(plan).spine_min_mm)
+    sample = background.sample_frames(recording, 96, stride)
+    return background.sampled_scene(sample, recording.camera.every(stride), target_of(plan)), stride
 
 
 def target_of(plan: Plan) -> support_plane.TargetAnimal:
@@ -531,7 +536,7 @@ def build_scene(
             recording, skeleton.view, n_frames, (foreground.near_mm, foreground.far_mm)
         )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
-    return learn_scene(
+    return learning.learn_scene(
         recording, sizes, n_frames, foreground.min_height_mm, skeleton.view, floor, region
     )
 

@@ -34,7 +34,7 @@ from liex_lab.recordings.frame import PLAUSIBLE_MM
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.runtime.text_files import read_toml
-from liex_lab.scene import background_segmenter, support_plane
+from liex_lab.scene import background_segmenter, learning, support_plane, zones
 from liex_lab.scene.background import (
     has_noise,
     sample_frames,
@@ -43,9 +43,7 @@ from liex_lab.scene.background import (
     stride_for,
 )
 from liex_lab.scene.floor import Floor, floor_patch
-from liex_lab.scene.learning import learn_scene
 from liex_lab.scene.scene import Arena, Fixture, find_arena
-from liex_lab.scene.zones import masks_apart
 from liex_lab.sessions.folder import megabytes
 from liex_lab.tracking.curve import repeat_messages
 
@@ -280,7 +278,7 @@ def _several(ideal: Recording, plan: Plan, misplaced: list[str]) -> list[section
             return propose_arenas(ideal, plan)
         found = arenas_of(ideal, plan)
         corners = {one.name: stated_corners(ideal, plan, one.region) for one in found}
-        masks_apart(corners, ideal.width, ideal.height)
+        zones.masks_apart(corners, ideal.width, ideal.height)
     except LiexError as error:
         if plan.arenas is not None:
             misplaced.append(str(error))
@@ -490,7 +488,7 @@ def _animal_facts(
     for wider in (1.0, 20.0):
         within = (sizes[0] / wider, sizes[1] * wider)
         try:
-            scene, frames = learn_scene(
+            scene, frames = learning.learn_scene(
                 memory, within, len(sample), min_height_mm, view, stated, region
             )
         except EstimationError as error:

@@ -20,8 +20,7 @@ from liex_lab.recordings import recording, streaming
 from liex_lab.recordings.frame import marked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.viewer import LiveView, need_screen
-from liex_lab.tracking import observations, track
-from liex_lab.tracking.curve import OnlineTracker
+from liex_lab.tracking import curve, observations, track
 from liex_lab.tracking.tracker import FrameTracker
 
 from .build import build_recording, build_tracker
@@ -135,7 +134,7 @@ def track_live(
         read=lambda index: held[index].frame.depth,
     )
     tracker = build_tracker(first, plan)
-    online = OnlineTracker(tracker.subject)
+    online = curve.OnlineTracker(tracker.subject)
     view = viewer(tracker, arriving) if viewer else None
     history = []
     latency = list[float]()

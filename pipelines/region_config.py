@@ -27,9 +27,8 @@ from liex_lab.plan import Plan, known_plans, plan, sections
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
 from liex_lab.recordings.frame import region_mask
 from liex_lab.runtime import durable, text_files
-from liex_lab.scene.background import sample_frames, usual_depth
+from liex_lab.scene import background, zones
 from liex_lab.scene.floor import Floor
-from liex_lab.scene.zones import region_corners_px
 from liex_lab.sessions import Session, evidence
 
 from .build import build_recording
@@ -275,8 +274,10 @@ class StatedRegions:
             whole = planned.plan.with_settings(["arena.region="])
             with build_recording(planned.recording, whole) as opened:
                 # number of sampled frames for each pixel's usual depth
-                sample = np.clip(np.rint(sample_frames(opened, 9)), 0, 65_535)
-                self._usual = {key: (usual_depth(sample.astype(np.uint16)), opened.camera)}
+                sample = np.clip(np.rint(background.sample_frames(opened, 9)), 0, 65_535)
+                self._usual = {
+                    key: (background.usual_depth(sample.astype(np.uint16)), opened.camera)
+                }
         return self._usual[key]
 
     def _planned(self, key: str) -> tuple[int, PlannedSession, Study]:
@@ -309,7 +310,7 @@ class StatedRegions:
             return None
         region = _region(place.stated)
         if region.unit == "px":
-            return _plain(region_corners_px(region))
+            return _plain(zones.region_corners_px(region))
         if session is None:
             raise PlanError(
                 "a region is stated in millimetres on the floor; it can be shown once the "
@@ -318,7 +319,7 @@ class StatedRegions:
         normal = -np.asarray(session.T_arena_camera.rotation)[2]
         height_mm = float(session.T_arena_camera.translation[2])
         floor = Floor.from_plane(normal, height_mm, session.camera)
-        return _plain(region_corners_px(region, session.camera, floor))
+        return _plain(zones.region_corners_px(region, session.camera, floor))
 
     def _checked(
         self, key: str, session: Session | None, corners: Sequence[Any]
@@ -329,7 +330,7 @@ class StatedRegions:
         region = _region(corners)
         camera = self._usual_depth(key)[1] if session is None else session.camera
         # raises an error if it is not valid
-        region_mask(region_corners_px(region), camera.width, camera.height)
+        region_mask(zones.region_corners_px(region), camera.width, camera.height)
         return [[round(float(value), 1) for value in corner] for corner in region.polygon or ()]
 
     def _text(self, place: Place, session: Session | None) -> str:

@@ -34,11 +34,9 @@ from liex_lab.behaviour.bouts import recognise
 from liex_lab.catalog import DEMO, find_sample
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.optics.camera import unusual_centre, unusual_lens
-from liex_lab.plan import Plan
-from liex_lab.plan.study import animal_part, find_subject, letters, same
-from liex_lab.recordings.frame import DepthFrame
+from liex_lab.plan import Plan, study
+from liex_lab.recordings import frame, timestamps
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.timestamps import JUMPED, PULSES_UNKNOWN, unwritable_times
 from liex_lab.runtime import durable, memory, processes
 from liex_lab.runtime.processes import WorkerPool
 from liex_lab.runtime.progress import Progress, reporting_compilation, silent
@@ -198,11 +196,11 @@ def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:
 _AT_ONCE = 2
 # imported while the first frames are measured: for the replay, `transitions` and the figures
 HEAVY = ("rerun", "scipy.special", "matplotlib.figure", "matplotlib.backends.backend_pdf")
-Observed = tuple[list[DepthFrame], observations.Observations]
+Observed = tuple[list[frame.DepthFrame], observations.Observations]
 
 
 def observed(
-    tracker: FrameTracker, stretches: Iterable[list[DepthFrame]]
+    tracker: FrameTracker, stretches: Iterable[list[frame.DepthFrame]]
 ) -> Generator[Observed, None, None]:
     """Stretches of frames with their single-frame observations, in order.
 
@@ -220,7 +218,7 @@ def observed(
         for frames in stretches:
             yield frames, tracker.observe(frames)
         return
-    waiting: deque[tuple[list[DepthFrame], Future[observations.Observations]]] = deque()
+    waiting: deque[tuple[list[frame.DepthFrame], Future[observations.Observations]]] = deque()
     # matrix products are serial meanwhile: the limit is per process, not per thread
     with (
         processes.serial_products(),
@@ -240,7 +238,9 @@ def observed(
                 coming.cancel()
 
 
-def _first(waiting: deque[tuple[list[DepthFrame], Future[observations.Observations]]]) -> Observed:
+def _first(
+    waiting: deque[tuple[list[frame.DepthFrame], Future[observations.Observations]]],
+) -> Observed:
     """The oldest stretch, once it is measured."""
     frames, coming = waiting.popleft()
     return frames, coming.result()
@@ -320,7 +320,7 @@ def run_session(
         build_recording(recording, first, progress) as opened,
     ):
         folder = folder or durable.inside(Path(out), first.session.name or opened.name, ".liex")
-        if problem := unwritable_times(opened.times_ns):
+        if problem := timestamps.unwritable_times(opened.times_ns):
             raise RecordingError(f"of {opened.name} {problem}")
         cautions: list[str] = []
         if isinstance(recording, str | Path) and opened.sources:
@@ -361,14 +361,16 @@ def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
     plan's differs from the metadata's.
     """
     recorded = str(opened.metadata.get("subject_id", ""))
-    found = find_subject(path, recorded)
+    found = study.find_subject(path, recorded)
     in_metadata = found.origin == "metadata"
     stated = plan.session.subject_id
     if stated is None:
-        named = animal_part(recorded) if in_metadata else found.id if found.origin else ""
+        named = study.animal_part(recorded) if in_metadata else found.id if found.origin else ""
         opened.metadata["subject_id"] = named
         return []
-    differ = in_metadata and same(found.id) != same(letters(animal_part(stated)))
+    differ = in_metadata and study.same(found.id) != study.same(
+        study.letters(study.animal_part(stated))
+    )
     # for several arenas the metadata name one animal at most
     alone = plan.arena.region is None
     return [f"{OTHER_ANIMAL}, {recorded} instead of {stated}"] if differ and alone else []
@@ -419,7 +421,7 @@ class Prepared:
             writer.resume(lambda row: self.recording.frame(row).depth)
             yield writer
 
-    def measure(self, frames: list[DepthFrame], writer: SessionWriter) -> None:
+    def measure(self, frames: list[frame.DepthFrame], writer: SessionWriter) -> None:
         """Measure consecutive frames of this recording and pass them to the session's writer."""
         began = time.perf_counter()
         estimates = self.fitted.tracker.observe(frames)
@@ -427,7 +429,7 @@ class Prepared:
         writer.add(frames, observations=estimates)
 
     def measure_all(
-        self, stretches: Iterable[list[DepthFrame]], writer: SessionWriter, progress: Progress
+        self, stretches: Iterable[list[frame.DepthFrame]], writer: SessionWriter, progress: Progress
     ) -> None:
         """Measure consecutive stretches of frames, some concurrently, and write them."""
         with closing(observed(self.fitted.tracker, stretches)) as coming:
@@ -508,7 +510,7 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
     )
 
 
-def read_ahead(opened: Recording, first: int) -> Generator[list[DepthFrame], None, None]:
+def read_ahead(opened: Recording, first: int) -> Generator[list[frame.DepthFrame], None, None]:
     """Chunks of frames from `first` on, the next read while one is measured.
 
     Rendered recordings are not read ahead, as rendering takes all cores.
@@ -533,7 +535,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     water = build_water(fitted.plan)
     # with water the ideal camera has another focal length
     lens = unusual_lens(recording.camera) if water is None else ""
-    jumps = [gap.start_frame for gap in recording.gaps if gap.reason == JUMPED]
+    jumps = [gap.start_frame for gap in recording.gaps if gap.reason == timestamps.JUMPED]
     centre, at_edge = unusual_centre(recording.camera)
     place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     verdict = Verdict.of(
@@ -556,7 +558,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *recording.files.grown(),
             *filter(None, [lens, "" if at_edge else centre]),
             *place,
-            *(f"{PULSES_UNKNOWN}, first before frame {k}" for k in jumps[:1]),
+            *(f"{timestamps.PULSES_UNKNOWN}, first before frame {k}" for k in jumps[:1]),
         ),
         accepted=fitted.plan.estimation.accept_misfit,
     )

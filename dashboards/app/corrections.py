@@ -18,8 +18,7 @@ import numpy as np
 from flask import Response, request
 
 from liex_lab.errors import LiexError, SessionError, one_line
-from liex_lab.sessions import correcting
-from liex_lab.sessions.corrections import Correction, read_log
+from liex_lab.sessions import correcting, corrections
 from liex_lab.sessions.review import (
     Clip,
     Review,
@@ -57,7 +56,7 @@ class Ticket:
     """
 
     folder: Path
-    what: Correction | None
+    what: corrections.Correction | None
     author: str
     message: str
     undoes: int = 0
@@ -90,7 +89,7 @@ class Saver:
         self._reporting: Path | None = None
         self._thread = threading.Thread(target=self._work, daemon=True)
 
-    def add(self, folder: Path, what: Correction, author: str) -> Ticket:
+    def add(self, folder: Path, what: corrections.Correction, author: str) -> Ticket:
         """Queue a correction by `author` of the session in `folder`."""
         return self._put(Ticket(folder, what, author, str(what)))
 
@@ -183,7 +182,7 @@ class Saver:
         undo = [ticket.undoes for ticket in batch if ticket.what is None]
         try:
             self._correct(folder, what, undo=undo, author=batch[0].author)
-            for entry in reversed(read_log(folder).entries):
+            for entry in reversed(corrections.read_log(folder).entries):
                 for ticket in reversed(batch):
                     made = (entry.what, entry.undoes) == (ticket.what, ticket.undoes)
                     if made and not ticket.number:
@@ -313,7 +312,7 @@ def _redo(saver: Saver, folder: Path, author: str) -> dict[str, Any]:
     """Repeat the last undone correction, once the queue is saved; returns its number."""
     for ticket in [*saver.tickets(folder).values()][-1:]:
         saver.wait(ticket)
-    log = read_log(folder)
+    log = corrections.read_log(folder)
     if log.redoable is None:
         raise SessionError("nothing was taken back since the last new correction")
     number, what = log.redoable
@@ -321,7 +320,7 @@ def _redo(saver: Saver, folder: Path, author: str) -> dict[str, Any]:
     return {"ticket": ticket.id, "message": f"made again: {what}", "number": log.undos[number]}
 
 
-def correction_in(desk: Desk, sentence: str, at_s: float) -> Correction:
+def correction_in(desk: Desk, sentence: str, at_s: float) -> corrections.Correction:
     """The correction in a sentence, see `correcting.parse_correction`.
 
     `flip` alone exchanges head and tail in the doubtful stretch at the moment, else in its frame.

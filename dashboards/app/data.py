@@ -21,9 +21,7 @@ from liex_lab.actions.vocabulary import PALETTE, action_colours
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions import Session
-from liex_lab.sessions.corrections import LOG, corrected_folder
-from liex_lab.sessions.verdict import SUBJECT, Entry
+from liex_lab.sessions import Session, corrections, verdict
 
 from ..figures.animals import Recent
 from ..report.report import warnings
@@ -67,7 +65,7 @@ class StudyData:
         entries: key -> state of each session, in the study's order.
     """
 
-    def __init__(self, name: str, list_entries: Callable[[], Sequence[Entry]]) -> None:
+    def __init__(self, name: str, list_entries: Callable[[], Sequence[verdict.Entry]]) -> None:
         self.name = name
         self._list_entries = list_entries
         self._lock = threading.RLock()
@@ -76,7 +74,7 @@ class StudyData:
         self._whole: tuple[Any, pd.DataFrame] | None = None
         # sessions whose tables stay in memory
         self._open = Recent(6)
-        self.entries: dict[str, Entry] = {}
+        self.entries: dict[str, verdict.Entry] = {}
         self.refresh()
 
     def refresh(self) -> None:
@@ -92,7 +90,7 @@ class StudyData:
         threading.Thread(target=self.collected, daemon=True).start()
 
     @property
-    def done(self) -> list[Entry]:
+    def done(self) -> list[verdict.Entry]:
         """The sessions with results."""
         return [one for one in self.entries.values() if one.state in DONE and one.folder]
 
@@ -133,7 +131,7 @@ class StudyData:
         rows = [
             {
                 "session": entry.key,
-                **{name: entry.subject.get(name, "") for name in SUBJECT},
+                **{name: entry.subject.get(name, "") for name in verdict.SUBJECT},
                 "state": entry.state,
                 "reason": entry.reason,
                 "remedy": entry.remedy,
@@ -142,7 +140,7 @@ class StudyData:
             for entry in self.entries.values()
         ]
         return pd.DataFrame(
-            rows, columns=["session", *SUBJECT, "state", "reason", "remedy", *QUALITY]
+            rows, columns=["session", *verdict.SUBJECT, "state", "reason", "remedy", *QUALITY]
         )
 
     def ethograms(self, keys: Iterable[str]) -> dict[str, SessionBouts]:
@@ -166,7 +164,7 @@ class StudyData:
             for entry, facts in measured
             if isinstance(facts["summary"], pd.DataFrame)
         ]
-        whole = pd.DataFrame(columns=["key", "session_id", *SUBJECT])
+        whole = pd.DataFrame(columns=["key", "session_id", *verdict.SUBJECT])
         if tables:
             whole, notes = cohort.unified(pd.concat(tables, ignore_index=True))
             whole.attrs["check"] = notes
@@ -218,14 +216,14 @@ class StudyData:
                 summary = columns[columns["table"] == "summary"].set_index("name")
                 yield summary.astype(object).where(summary.notna(), "")
 
-    def _measured(self) -> list[tuple[Entry, dict[str, Any]]]:
+    def _measured(self) -> list[tuple[verdict.Entry, dict[str, Any]]]:
         """Every measured session with its facts."""
         done = self.done
         # threads; most of the time is spent opening files
         with ThreadPoolExecutor(4) as pool:
             return list(zip(done, pool.map(self._facts_of, done), strict=True))
 
-    def _facts_of(self, entry: Entry) -> dict[str, Any]:
+    def _facts_of(self, entry: verdict.Entry) -> dict[str, Any]:
         """What the study's pages show of a session (`_FACTS`); kept until its folder changes."""
         folder = entry.folder
         assert folder is not None
@@ -329,7 +327,7 @@ def raster(
 def _stamp(folder: Path) -> Any:
     """Times, sizes and inodes; they change when the session is rewritten or corrected."""
     stamps: dict[str, tuple[int, int, int]] = {}
-    for path in (folder / "session.json", corrected_folder(folder) / LOG):
+    for path in (folder / "session.json", corrections.corrected_folder(folder) / corrections.LOG):
         with suppress(OSError):
             found = path.stat()
             stamps[path.name] = (found.st_mtime_ns, found.st_size, found.st_ino)

@@ -17,10 +17,7 @@ from numpy.typing import NDArray
 from liex_lab.actions.vocabulary import action_colours
 from liex_lab.behaviour.kinematics import IMPOSSIBLE_MM_S
 from liex_lab.errors import LiexError, SessionError
-from liex_lab.sessions import Session
-from liex_lab.sessions.correcting import disagreements
-from liex_lab.sessions.corrections import author_name, read_log
-from liex_lab.sessions.evidence import read_centres
+from liex_lab.sessions import Session, correcting, corrections, evidence
 
 from ..figures.animals import Array, DepthImages, SessionAnimal
 from ..report.contact_sheet import png
@@ -62,7 +59,7 @@ class Desk(Footage):
     @cached_property
     def notes(self) -> list[str]:
         """Sentences on exchanges of head and tail that contradict the neighbouring frames."""
-        return disagreements(self.session)
+        return correcting.disagreements(self.session)
 
     def about(self) -> dict[str, Any]:
         """Facts that the page needs once: size, animals, coloured actions, and the author."""
@@ -82,7 +79,7 @@ class Desk(Footage):
                 for one, (_, half) in zip(self.animals, self.paths, strict=True)
             ],
             "actions": coloured_actions(list(self.session.metadata.get("actions") or {})),
-            "author": author_name(),
+            "author": corrections.author_name(),
         }
 
     def rows(self, first: int, stop: int) -> dict[str, Any]:
@@ -169,12 +166,12 @@ class Desk(Footage):
                 "author": entry.author,
                 "made_at": entry.made_at,
             }
-            for entry in read_log(self.session.path).standing
+            for entry in corrections.read_log(self.session.path).standing
         ]
 
     def redo(self) -> str:
         """The correction that was last undone and can be repeated; "" if none."""
-        redoable = read_log(self.session.path).redoable
+        redoable = corrections.read_log(self.session.path).redoable
         return "" if redoable is None else str(redoable[1])
 
     def image(self, row: int, box: Sequence[int]) -> bytes:
@@ -263,7 +260,7 @@ def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretc
                 "perhaps exchanged",
             )
     if len(animals) == 1 and (session.metadata.get("verdict") or {}).get("n_animals", 1) > 1:
-        centres = read_centres(session)
+        centres = evidence.read_centres(session)
         if centres is not None:
             away_mm = np.linalg.norm(centres[:, 1] - centres[:, 0], axis=1)
             found += _meetings(

@@ -23,12 +23,10 @@ from matplotlib.ticker import MaxNLocator
 from werkzeug.exceptions import NotFound
 
 from liex_lab.actions.vocabulary import PALETTE, UNLABELLED_COLOUR
-from liex_lab.behaviour import cohort
-from liex_lab.behaviour.body import logged_of
+from liex_lab.behaviour import body, cohort
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan.study import references_first
-from liex_lab.sessions import Session, correcting
-from liex_lab.sessions.corrections import author_name
+from liex_lab.sessions import Session, correcting, corrections
 
 from ..figures import groups, sets, times
 from ..figures.style import (
@@ -475,7 +473,7 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
         "group": subject.get("group", ""),
         "headline": f"{', '.join(stated)} · {extent}" if stated else extent,
         "warnings": warnings(session),
-        "author": author_name(),
+        "author": corrections.author_name(),
         "scene": [(kind, MARKS[kind][0]) for kind in kinds],
         "arena": f"/arena/{path}",
         "report": f"/report/{path}" if session.has("report.html") else "",
@@ -511,7 +509,7 @@ def facts(session: Session, at_s: float) -> list[tuple[str, str]]:
     found = [(title, frame[name], unit) for name, title, unit in _FACTS if name in frame]
     if session.has("kinematics.parquet"):
         moved = session.kinematics.iloc[row]
-        curves = logged_of(session.metadata["animal"])
+        curves = body.logged_of(session.metadata["animal"])
         measured = [(one.column, one.title.lower(), one.unit) for one in curves]
         found += [
             (title, *shown(moved[name], unit))

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from liex_lab.behaviour.activity import hold_times
 from liex_lab.errors import LiexError
-from liex_lab.sessions import Session
-from liex_lab.sessions.cutouts import meant_to_keep_depth, open_depth
+from liex_lab.sessions import Session, cutouts
 
 Array = NDArray[np.float64]
 Held = TypeVar("Held")
@@ -236,7 +235,7 @@ class DepthImages:
 
         def opened() -> tuple[ExitStack, Any]:
             stack = ExitStack()
-            return stack, stack.enter_context(open_depth(session))
+            return stack, stack.enter_context(cutouts.open_depth(session))
 
         with self._lock:
             try:
@@ -256,7 +255,7 @@ class DepthImages:
 
 def keeps_depth(session: Session) -> bool:
     """Whether the session's replay contains depth, beyond the thumbnails of the report."""
-    return meant_to_keep_depth(session) and session.has("session.mcap")
+    return cutouts.meant_to_keep_depth(session) and session.has("session.mcap")
 
 
 def _thumbnail(session: Session, row: int) -> NDArray[np.uint16] | None:

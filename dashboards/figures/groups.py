@@ -15,9 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from liex_lab.actions.vocabulary import action_colours
+from liex_lab.behaviour import cohort, statistics
 from liex_lab.behaviour.activity import Occupancy, occupancy
-from liex_lab.behaviour.cohort import counted_units
-from liex_lab.behaviour.statistics import animal_means
 from liex_lab.plan.study import references_first
 from liex_lab.sessions import Session
 
@@ -290,7 +289,7 @@ def effects(stats: pd.DataFrame, units: Mapping[str, str]) -> Figure | None:
         range(len(known)),
         [
             f"{titled(str(row['measure']), units.get(str(row['measure']), ''))}: "
-            f"{row['contrast']}, n = {counted_units(row)}"
+            f"{row['contrast']}, n = {cohort.counted_units(row)}"
             for row in known.to_dict("records")
         ],
         size=5.5,
@@ -312,7 +311,7 @@ def _strip(
 ) -> None:
     """One group: a small mark per session, a large one per animal, a line at the animals' mean."""
     animal, names_of = pd.factorize(rows["subject_id"].astype(str))
-    means = animal_means(values, animal)
+    means = statistics.animal_means(values, animal)
     beside = np.linspace(-0.2, 0.2, len(names_of)) if len(names_of) > 1 else np.zeros(1)
     colour, mark = group_colour(names[k], names), GROUP_MARKS[k % len(GROUP_MARKS)]
     large = axes.scatter(
@@ -368,7 +367,10 @@ def _differences(axes: Axes, own: pd.DataFrame, factor: float, unit: str) -> Non
         )
     axes.set_yticks(
         range(len(known)),
-        [f"{row['contrast']}\nn = {counted_units(row)}".replace(", ", ",\n") for row in rows],
+        [
+            f"{row['contrast']}\nn = {cohort.counted_units(row)}".replace(", ", ",\n")
+            for row in rows
+        ],
         size=5.5,
     )
     axes.set(

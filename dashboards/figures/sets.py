@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 from liex_lab.behaviour.cohort import SUBJECT
 from liex_lab.errors import SessionError
 from liex_lab.plan.study import references_first
-from liex_lab.runtime.durable import inside, replacing, safe_name, unlinked
+from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.text_files import read_harmless
 from liex_lab.sessions import Session
 
 from . import groups, places, times
@@ -70,7 +69,7 @@ def session_figures(session: Session, only: Sequence[str] = ()) -> Iterator[Draw
     for animal in session_animals(session):
         for name in only or OF_SESSION:
             what, draw = OF_SESSION[name]
-            own = name if animal.alone else safe_name(f"{name}-{animal.individual}")
+            own = name if animal.alone else durable.safe_name(f"{name}-{animal.individual}")
             yield own, what, draw(animal)
 
 
@@ -132,7 +131,7 @@ def _of_many(
 
 def _name_of(measure: str) -> str:
     """The name of a comparison's figure of a measure."""
-    return safe_name(f"compare_{measure}")
+    return durable.safe_name(f"compare_{measure}")
 
 
 def remove_others(folder: Path, measures: Sequence[str]) -> None:
@@ -208,9 +207,9 @@ def put_figure(folder: Path, name: str, content: bytes) -> Path:
     Raises:
         PlaceError: the path is a symbolic link.
     """
-    unlinked(folder).mkdir(parents=True, exist_ok=True)
-    place = inside(folder, Path(name).stem, Path(name).suffix)
-    with replacing(place) as part:
+    durable.unlinked(folder).mkdir(parents=True, exist_ok=True)
+    place = durable.inside(folder, Path(name).stem, Path(name).suffix)
+    with durable.replacing(place) as part:
         part.write_bytes(content)
     return place
 
@@ -228,7 +227,9 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
         SessionError: its files are missing or damaged.
     """
     try:
-        table = read_harmless(folder / "sessions.csv", ("session_id", "individual", *SUBJECT))
+        table = text_files.read_harmless(
+            folder / "sessions.csv", ("session_id", "individual", *SUBJECT)
+        )
         stats = pd.read_parquet(folder / "stats.parquet")
         document = json.loads((folder / COMPARISON_FILE).read_text(encoding="utf-8"))
         places = [folder / str(place) for place in document["sessions"]]

@@ -11,11 +11,8 @@ import rerun.blueprint as rrb
 
 from liex_lab.behaviour.body import drawn_measures
 from liex_lab.runtime.durable import replacing, write_whole
-from liex_lab.sessions import Session
-from liex_lab.sessions.cutouts import ALL, ANIMAL, N_BOXES, N_WINDOWS, NONE
+from liex_lab.sessions import Session, cutouts, rrd_scene, viewer
 from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
-from liex_lab.sessions.rrd_scene import CUTOUTS, cutout_entity, cutout_frame
-from liex_lab.sessions.viewer import ERROR
 
 
 def write_blueprint(session: Session) -> Path:
@@ -39,7 +36,7 @@ def live_blueprint(body_m: float) -> Any:
         contents=["$origin/**", f"+ /{SKELETON}/**"],
         name="depth with the skeleton",
     )
-    error = rrb.TimeSeriesView(origin=ERROR, name="predicted error (mm)")
+    error = rrb.TimeSeriesView(origin=viewer.ERROR, name="predicted error (mm)")
     return _blueprint(
         rrb.Vertical(rrb.Horizontal(_scene(body_m, SKELETON), image), error, row_shares=[4, 1])
     )
@@ -65,23 +62,23 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     # the coordinate frames of the cut-outs in the image, by their entities; rerun's types of
     # overrides leave them out
     frames: dict[Any, Any] = {
-        cutout_entity(k, which): rr.CoordinateFrame(cutout_frame(k))
-        for k in range(N_BOXES)
-        for which in range(N_WINDOWS)
+        rrd_scene.cutout_entity(k, which): rr.CoordinateFrame(rrd_scene.cutout_frame(k))
+        for k in range(cutouts.N_BOXES)
+        for which in range(cutouts.N_WINDOWS)
     }
     image: Any = rrb.Spatial2DView(
         origin="arena/camera/image",
         contents=[
             "$origin/**",
-            f"+ /{CUTOUTS}/**",
+            f"+ /{rrd_scene.CUTOUTS}/**",
             *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected),
         ],
-        overrides={} if kept in (ALL, NONE) else frames,
+        overrides={} if kept in (cutouts.ALL, cutouts.NONE) else frames,
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
     )
-    if kept == ANIMAL:  # above it, a view whose camera follows the animal
+    if kept == cutouts.ANIMAL:  # above it, a view whose camera follows the animal
         zoomed = rrb.Spatial2DView(
-            origin=f"{CUTOUTS}/1",
+            origin=f"{rrd_scene.CUTOUTS}/1",
             contents=["$origin/**", f"+ /{at(SKELETON)}/**"],
             name="the animal, zoomed",
         )

@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from liex_lab.actions.ethogram import ACROSS_GAPS
-from liex_lab.actions.vocabulary import NO_POSE, UNLABELLED_COLOUR, action_colours
+from liex_lab.actions import ethogram, vocabulary
 from liex_lab.behaviour.body import axis_of
 from liex_lab.optics.camera import SensorCard
 from liex_lab.runtime.durable import write_whole
-from liex_lab.sessions import Session
-from liex_lab.sessions.correcting import disagreements
+from liex_lab.sessions import Session, correcting, verdict
 from liex_lab.sessions.session import found_video
-from liex_lab.sessions.verdict import verdict_in
 
 from ..figures.animals import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
@@ -59,7 +56,7 @@ def methods(session: Session) -> list[str]:
         defined=[f"{word}: {meaning}" for word, meaning in named.items() if meaning],
         bare=[word for word, meaning in named.items() if not meaning],
         checked=any("(checked: " in meaning for meaning in actions.values()),
-        across_gaps=ACROSS_GAPS,
+        across_gaps=ethogram.ACROSS_GAPS,
     )
 
 
@@ -96,7 +93,7 @@ def warnings(session: Session) -> list[str]:
         error=error,
         spine=spine,
         flips=session.flips,
-        disagreements=disagreements(session),
+        disagreements=correcting.disagreements(session),
         behaviour=behaviour,
         noise=noise,
         pause=(about.get("rules") or {}).get("pause_below_mm_s", np.nan),
@@ -265,14 +262,14 @@ def render(session: Session, figures: Path | None = None) -> str:
         headline=headline(session),
         cards=cards(session),
         subject=", ".join(f"{k.replace('_', ' ')} {v}" for k, v in about["subject"].items()),
-        verdict=verdict_in(about),
+        verdict=verdict.verdict_in(about),
         warnings=warnings(session),
         account=frame_account(session),
         flips=likely.to_dict("records"),
         thumbnails=thumbnails(session),
         whole_image=whole_image(session),
         n_animals=(about.get("verdict") or {}).get("n_animals", 1),
-        no_pose=NO_POSE,
+        no_pose=vocabulary.NO_POSE,
         top_mm=scale_mm([session]),
         last_joint=about["animal"]["joints"][-1].replace("_", " "),
         figures=for_the_page(session, figures),
@@ -281,7 +278,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         unresolved=about.get("unresolved_actions") or {},
         summary=summary_rows(session, words),
         budget=budget_rows(session, words),
-        across_gaps=ACROSS_GAPS,
+        across_gaps=ethogram.ACROSS_GAPS,
         arena=session.arena,
         zones=session.zones,
         zone_rows=session.table("zones").to_dict("records") if session.has("zones.parquet") else [],
@@ -399,7 +396,10 @@ def budget_rows(session: Session, words: list[str]) -> list[tuple[str, str, list
         return []
     row = session.summary.iloc[0]
     rows = []
-    for word, colour in (*action_colours(words).items(), ("unlabelled", UNLABELLED_COLOUR)):
+    for word, colour in (
+        *vocabulary.action_colours(words).items(),
+        ("unlabelled", vocabulary.UNLABELLED_COLOUR),
+    ):
         if f"{word}_s" in row:  # sessions of an older version lack some of the others
             values = [row.get(f"{word}_{what}", np.nan) for what, _ in _BUDGET]
             texts = [

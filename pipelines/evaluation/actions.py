@@ -29,7 +29,7 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.metrics import f1_score
 from sklearn.tree import DecisionTreeClassifier
 
-from liex_lab.actions import channels, ethogram, storage, vocabulary
+from liex_lab.actions import channels, ethogram, learning, storage, vocabulary
 from liex_lab.actions.labels import (
     Array,
     LabelledTrack,
@@ -37,7 +37,6 @@ from liex_lab.actions.labels import (
     interval95,
     timeline_scores,
 )
-from liex_lab.actions.learning import DESCRIPTORS
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.behaviour.bouts import measure_bouts, recognise
 from liex_lab.behaviour.kinematics import Joints, kinematics
@@ -239,7 +238,7 @@ def paper_names(
     """
     words = [str(one.words[0]) for one in train]
     found = {}
-    for kind, described in DESCRIPTORS.items():
+    for kind, described in learning.DESCRIPTORS.items():
         rows, asked = (np.stack([described(one.track) for one in some]) for some in (train, test))
         forests = (RandomForestClassifier(50, max_depth=20, random_state=k) for k in range(_SEEDS))
         found[kind] = [forest.fit(rows, words).predict(asked).tolist() for forest in forests]

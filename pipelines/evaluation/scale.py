@@ -36,8 +36,7 @@ from liex_lab.runtime.processes import Done, Processes, Work
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Provenance, Session, SessionWriter, cutouts, evidence, mcap, rrd
 from liex_lab.tables.rows import Rows, stop_times
-from liex_lab.tracking.curve import track_whole
-from liex_lab.tracking.observations import COLUMNS, Observations
+from liex_lab.tracking import curve, observations
 from liex_lab.tracking.track import Subject
 
 from ..build import build_provenance, build_recording, build_tracker, kept_estimator
@@ -360,8 +359,8 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
     with SessionWriter(Path(out) / "long.liex", origin, report=write_report) as writer:
         for frames, part in _parts(depth, observed, n):
             writer.add(frames, observations=part)
-        whole = writer.observations(Observations)
-        track = track_whole(subject, whole, allocate=writer.allocate)
+        whole = writer.observations(observations.Observations)
+        track = curve.track_whole(subject, whole, allocate=writer.allocate)
         writer.take(track, whole, subject)
         del whole, track
         conclude(writer, plan, {"prepare": 0.0, "track": 0.0})
@@ -370,7 +369,7 @@ def write_long(minutes: float, out: str | Path) -> dict[str, Any]:
 
 def _measure_short(
     plan: Plan,
-) -> tuple[list[np.ndarray[Any, Any]], Observations, Subject, Provenance]:
+) -> tuple[list[np.ndarray[Any, Any]], observations.Observations, Subject, Provenance]:
     """Render and measure the short recording, without keeping its full depth images.
 
     Returns:
@@ -379,7 +378,9 @@ def _measure_short(
     with open_recording(_VIRTUAL.format(seed=5, n=300, sensor="primesense-qvga")) as opened:
         short = looped(opened, len(opened))
     tracker = build_tracker(short, plan)
-    observed = Observations.join([tracker.observe(frames) for frames in short.chunks(32)])
+    observed = observations.Observations.join(
+        [tracker.observe(frames) for frames in short.chunks(32)]
+    )
     camera = short.camera.every(_COARSER)
     depth = [np.ascontiguousarray(frame.depth[::_COARSER, ::_COARSER]) for frame in short]
     return (
@@ -391,16 +392,17 @@ def _measure_short(
 
 
 def _parts(
-    depth: list[np.ndarray[Any, Any]], observed: Observations, n: int
-) -> Iterator[tuple[list[DepthFrame], Observations]]:
+    depth: list[np.ndarray[Any, Any]], observed: observations.Observations, n: int
+) -> Iterator[tuple[list[DepthFrame], observations.Observations]]:
     """The frames of a long recording, coarser, and the observations in them."""
     all_rows = to_and_fro(len(depth), n)
     for start in range(0, n, _BLOCK):
         rows = all_rows[start : start + _BLOCK]
         times = (start + np.arange(len(rows), dtype=np.int64)) * STEP_NS
-        part = Observations(
+        part = observations.Observations(
             observed.skeleton,
-            **{name: getattr(observed, name)[rows] for name in COLUMNS} | {"times_ns": times},
+            **{name: getattr(observed, name)[rows] for name in observations.COLUMNS}
+            | {"times_ns": times},
         )
         yield (
             [DepthFrame(start + k, int(times[k]), depth[row]) for k, row in enumerate(rows)],

@@ -44,10 +44,9 @@ from liex_lab.estimation.cascade import Candidates, ImageSet, draw_starts, start
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
-from liex_lab.recordings import open_recording
+from liex_lab.recordings import open_recording, streaming
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
-from liex_lab.recordings.streaming import replayed
 from liex_lab.recordings.writer import ImageFolderWriter, McapDepthWriter, RecordingWriter
 from liex_lab.runtime.processes import own_python
 from liex_lab.runtime.progress import Progress, silent
@@ -405,14 +404,20 @@ def _film(
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
         plan = plan_of(animal)
         # 60 frames tracked beforehand, a thousand times as fast
-        track_live(replayed(arriving[: learn_frames + 60], 1000.0), plan, learn_frames=learn_frames)
+        track_live(
+            streaming.replayed(arriving[: learn_frames + 60], 1000.0),
+            plan,
+            learn_frames=learn_frames,
+        )
         if ready is not None:
             ready.wait()
     except BaseException:
         if ready is not None:
             ready.abort()  # the others would wait forever
         raise
-    numbers, _ = track_live(replayed(arriving), plan, learn_frames=learn_frames, progress=progress)
+    numbers, _ = track_live(
+        streaming.replayed(arriving), plan, learn_frames=learn_frames, progress=progress
+    )
     return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers}
 
 

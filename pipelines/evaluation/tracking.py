@@ -41,12 +41,10 @@ from liex_lab.runtime.processes import threads
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.simulation import simulator
-from liex_lab.tracking.curve import OnlineTracker
-from liex_lab.tracking.observations import Observations
+from liex_lab.tracking import curve, observations, trust
 from liex_lab.tracking.particles import SEARCHED, ParticleFilter, ProcessNoise
 from liex_lab.tracking.track import Track
 from liex_lab.tracking.tracker import FrameTracker
-from liex_lab.tracking.trust import single_frames
 
 from ..build import build_scene, plan_of
 from ..training.pose_model import estimator_of
@@ -158,7 +156,7 @@ def follow_sequence(
     )
     tracker = FrameTracker.prepare(estimator, scene, sample, bridge_s=plan.tracking.bridge_s)
     n = len(recording)
-    parts: list[Observations] = []
+    parts: list[observations.Observations] = []
     single_s = observe_s = 0.0
     for frames in recording.chunks(_CHUNK):
         progress(frames[0].index, n, f"measuring {recording.name}")
@@ -169,7 +167,7 @@ def follow_sequence(
         parts.append(tracker.observe(frames))
         single_s += between - began
         observe_s += time.perf_counter() - between
-    observed = Observations.join(parts)
+    observed = observations.Observations.join(parts)
     tracker.track(parts[0])  # compile before the clock runs
     _online(tracker, parts[0])
     T = recording.T_arena_camera @ scene.floor.T_arena_camera.inverse()
@@ -178,7 +176,7 @@ def follow_sequence(
         joints, tip = T @ track.joints_mm, estimator.skeleton.tip
         return Followed(joints, recording.joints_arena, track.sd_xyz_mm, n / seconds, tip)
 
-    rows = {"single": row(single_frames(tracker.subject, observed), single_s)}
+    rows = {"single": row(trust.single_frames(tracker.subject, observed), single_s)}
     progress(0, n, f"Algorithm 3 on {recording.name}")
     rows["algorithm3"] = follow(
         recording,
@@ -200,9 +198,9 @@ def follow_sequence(
     return rows, _speed(tracker, recording)
 
 
-def _online(tracker: FrameTracker, observed: Observations) -> Track:
+def _online(tracker: FrameTracker, observed: observations.Observations) -> Track:
     """The track of the online tracker, with a lag of at most `ONLINE_LAG` frames."""
-    online = OnlineTracker(tracker.subject, ONLINE_LAG)
+    online = curve.OnlineTracker(tracker.subject, ONLINE_LAG)
     return Track.join([part for part in (online.add(observed), online.close()) if part is not None])
 
 
@@ -219,7 +217,9 @@ def _speed(tracker: FrameTracker, recording: simulator.TestSequence) -> dict[str
         for name, parallel in zip(best, (False, True), strict=True):
             began = time.perf_counter()
             with threads(parallel):
-                tracker.track(Observations.join([tracker.observe(frames) for frames in chunks]))
+                tracker.track(
+                    observations.Observations.join([tracker.observe(frames) for frames in chunks])
+                )
             best[name] = max(best[name], sum(map(len, chunks)) / (time.perf_counter() - began))
     return {**best, "cores": float(numba.get_num_threads())}
 

@@ -20,9 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from liex_lab.errors import MissingPackageError, StudyError, how_to_install
 from liex_lab.plan import plans_folder
-from liex_lab.runtime.durable import Scratch
+from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.processes import n_cores, worker_environment
-from liex_lab.runtime.text_files import read_toml
 from liex_lab.sessions.provenance import first_error
 
 from .crew import DEATHS, Crew
@@ -166,7 +165,7 @@ class SlurmTable(BaseModel):
                 f"there is no file {file}; copy {plans_folder() / 'slurm.toml'} and change the copy"
             )
         try:
-            return SlurmTable.model_validate(read_toml(file))
+            return SlurmTable.model_validate(text_files.read_toml(file))
         except ValueError as error:
             why = first_error(error) if isinstance(error, ValidationError) else error
             raise StudyError(
@@ -308,7 +307,7 @@ def crew_of(
                     "scheduler`, or leave --scheduler out"
                 ) from None
             return
-        scratch = str(stack.enter_context(closing(Scratch())).folder)
+        scratch = str(stack.enter_context(closing(durable.Scratch())).folder)
         stack.enter_context(dask.config.set({"temporary-directory": scratch}))
         cluster = (
             slurm_cluster(slurm, scratch)

@@ -17,17 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from liex_lab.errors import RecordingError, StudyError
 from liex_lab.plan.study import PlannedSession
-from liex_lab.runtime.processes import Done, Work, WorkerPool
+from liex_lab.runtime import processes, text_files
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.runtime.text_files import loose_json
-from liex_lab.sessions.folder import (
-    describe_failure,
-    read_failure,
-    set_outdated,
-    taken_from,
-    write_failure,
-)
-from liex_lab.sessions.verdict import read_verdict
+from liex_lab.sessions import folder, verdict
 
 from .status import (
     INSPECTING,
@@ -52,7 +44,7 @@ def measure_one(
     run: RunSession,
     progress: Progress = silent,
     run_id: str = "",
-    pool: WorkerPool | None = None,
+    pool: processes.WorkerPool | None = None,
 ) -> dict[str, Any]:
     """Measure a session, or quarantine it, and report the result.
 
@@ -95,13 +87,13 @@ def measure_one(
             progress=stage,
         )
     except Exception as error:
-        failure = describe_failure(error, stage.name, stage.frame) | {"run_id": run_id}
+        failure = folder.describe_failure(error, stage.name, stage.frame) | {"run_id": run_id}
         return quarantine(session, failure) | {"seconds": round(time.perf_counter() - began, 3)}
     return {
         **_result(session, "done"),
         "seconds": round(time.perf_counter() - began, 3),
-        "corrections_taken_from": taken_from(session.folder),
-        "review": review_note(read_verdict(session.folder)),
+        "corrections_taken_from": folder.taken_from(session.folder),
+        "review": review_note(verdict.read_verdict(session.folder)),
     }
 
 
@@ -113,10 +105,10 @@ def _result(
 
 def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
     """The session's result if it ended in this run already, before its worker could report it."""
-    failure = read_failure(session.folder)
+    failure = folder.read_failure(session.folder)
     if failure and failure.get("run_id") == run_id:
         return _result(session, "failed", failure)
-    same = loose_json(session.folder / "session.json").get("run_id") == run_id
+    same = text_files.loose_json(session.folder / "session.json").get("run_id") == run_id
     return _result(session, "done") if same else None
 
 
@@ -131,8 +123,8 @@ def quarantine(session: PlannedSession, failure: dict[str, Any]) -> dict[str, An
         "plan": session.plan.model_dump(exclude_none=True),
         "input": {"stamp": input_stamp(session.recording)},
     }
-    set_outdated(session.folder)
-    write_failure(session.folder, known)
+    folder.set_outdated(session.folder)
+    folder.write_failure(session.folder, known)
     return _result(session, "failed", failure)
 
 
@@ -253,7 +245,7 @@ def n_shared(n: int, n_workers: int) -> int:
 
 
 def _why_died(error: BaseException, stage: str) -> dict[str, Any]:
-    failure = describe_failure(error, stage, None)
+    failure = folder.describe_failure(error, stage, None)
     if type(error).__name__ == "KilledWorker":
         failure |= {
             "reason": f"the worker process died {DEATHS + 1} times while it measured this session",
@@ -302,7 +294,9 @@ class Workers:
     fewest = 0
     here = False
 
-    def each(self, do: Callable[[Work], Done], works: Sequence[Work]) -> Iterator[Done]:
+    def each(
+        self, do: Callable[[processes.Work], processes.Done], works: Sequence[processes.Work]
+    ) -> Iterator[processes.Done]:
         """Results of a task per shard, as they arrive; see `workers.WorkerPool`.
 
         The calling task yields its worker meanwhile, which measures shards like the others.

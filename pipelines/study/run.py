@@ -17,10 +17,8 @@ import pandas as pd
 
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
-from liex_lab.runtime import durable, text_files
-from liex_lab.runtime.progress import Board
-from liex_lab.sessions import Session, verdict
-from liex_lab.sessions.corrections import Description
+from liex_lab.runtime import durable, progress, text_files
+from liex_lab.sessions import Session, corrections, verdict
 from liex_lab.sessions.folder import FAILED_FILE, read_failure
 from liex_lab.tables.schema import dictionary, table_columns, write_table
 
@@ -197,7 +195,7 @@ def run_study(
     again: bool,
     only: Sequence[str],
     dry_run: bool,
-    board: Callable[[int], AbstractContextManager[Board]],
+    board: Callable[[int], AbstractContextManager[progress.Board]],
     # writes descriptions into a session, with their author: `liex_lab.api.correct_session`
     describe: Callable[..., Path],
     inspect: InspectSession = inspect_animal,
@@ -252,7 +250,9 @@ def run_study(
                 before = ask()
             for one in before:
                 if one.described:
-                    descriptions = [Description(key, value) for key, value in one.described.items()]
+                    descriptions = [
+                        corrections.Description(key, value) for key, value in one.described.items()
+                    ]
                     describe(one.session.folder, descriptions, author=f"study {study.name}")
             if (todo := _to_measure(before)) and crew:
                 _measure(todo, run, crew, board)
@@ -287,7 +287,7 @@ def _inspect(
     sessions: Sequence[PlannedSession],
     inspect: InspectSession,
     crew: Crew,
-    board: Callable[[int], AbstractContextManager[Board]],
+    board: Callable[[int], AbstractContextManager[progress.Board]],
 ) -> None:
     """Inspect sessions, and store the findings."""
     known = {session.id: session for session in sessions}
@@ -302,7 +302,7 @@ def _inspect(
         crew.inspect(sessions, inspect, shown.report, finished)
 
 
-def _ended(shown: Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
+def _ended(shown: progress.Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
     """Show that the work on a session ended: a sentence, or the failure that ended it."""
     sentence = done if isinstance(done, str) else f"{failed}: {done['reason']}"
     shown.finish(id, sentence, failed=not isinstance(done, str))
@@ -312,7 +312,7 @@ def _measure(
     todo: list[SessionStatus],
     run: RunSession,
     crew: Crew,
-    board: Callable[[int], AbstractContextManager[Board]],
+    board: Callable[[int], AbstractContextManager[progress.Board]],
 ) -> None:
     with board(len(todo)) as shown:
 

@@ -22,11 +22,9 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model, sha256
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.estimation.session_shape import PLACES
-from liex_lab.plan import Plan
-from liex_lab.plan.sections import N_PLACES, Factor, Positive, SharedBody, SharedShape
+from liex_lab.plan import Plan, sections
 from liex_lab.plan.study import VIRTUAL, PlannedSession, Study, find_subject, same
-from liex_lab.runtime import durable
-from liex_lab.runtime.processes import in_background
+from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
 from liex_lab.sessions.folder import describe_failure, read_failure
@@ -147,8 +145,8 @@ class _ShapeFound(_Part):
 
 
 class _AnimalFound(_Part):
-    spine_mm: Positive
-    girth: Factor
+    spine_mm: sections.Positive
+    girth: sections.Factor
     shape: _ShapeFound | None = None
 
 
@@ -231,7 +229,7 @@ def together(
         )
         return [replace(s, remark=why) for s in group]
     agreed = agree(found)
-    body = SharedBody(
+    body = sections.SharedBody(
         subject=subject,
         n_sessions=len(found),
         spine_mm=None if agreed.spine_mm is None else round(agreed.spine_mm, 3),
@@ -273,16 +271,16 @@ def found_in(inspection: Mapping[str, Any]) -> SessionBody:
         read.log_sd,
         read.n_frames,
         read.animal.girth,
-        shape_labels(SharedShape.model_validate(stated)) if shape.kept else None,
+        shape_labels(sections.SharedShape.model_validate(stated)) if shape.kept else None,
         # a shape was tried, and rejected on held-out frames
         not shape.kept and shape.residual_mm is not None,
         shape.n_frames,
     )
 
 
-def _shape(labels: Any) -> SharedShape:
+def _shape(labels: Any) -> sections.SharedShape:
     p = len(PLACES)
-    return SharedShape(
+    return sections.SharedShape(
         width=np.exp(labels[-2 * p : -p]).round(_DECIMALS).tolist(),
         height=np.exp(labels[-p:]).round(_DECIMALS).tolist(),
         joints_moved=labels[: -2 * p].reshape(-1, 3).round(_DECIMALS).tolist(),
@@ -341,7 +339,7 @@ def _found(session: PlannedSession, progress: Progress) -> dict[str, Any]:
         )
     plan = session.plan
     with (
-        in_background(partial(build_estimator, plan)) as estimator,
+        processes.in_background(partial(build_estimator, plan)) as estimator,
         build_recording(session.recording, plan, progress) as opened,
     ):
         progress(0, None, INSPECTING)
@@ -387,7 +385,7 @@ def read_inspection(session: PlannedSession) -> dict[str, Any] | None:
         if not _why_not(inspection) and not failed:
             found = found_in(inspection)
             n_joints = Skeleton.load(session.plan.animal.skeleton).n_joints
-            if found.shape is not None and len(found.shape) != 3 * n_joints + 2 * N_PLACES:
+            if found.shape is not None and len(found.shape) != 3 * n_joints + 2 * sections.N_PLACES:
                 return None
     except (OSError, LiexError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None

@@ -17,8 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from liex_lab.actions import learning, storage, vocabulary
-from liex_lab.actions.ethogram import UNLABELLED
+from liex_lab.actions import ethogram, learning, storage, vocabulary
 from liex_lab.actions.labels import LabelledTrack, read_labels, sessions_named, words_of
 from liex_lab.body.pose import Array, Pose
 from liex_lab.body.shape import BodyShape
@@ -30,21 +29,12 @@ from liex_lab.optics.camera import Camera
 from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Patches
-from liex_lab.sessions import Session
-from liex_lab.sessions.evidence import track_of, wall_of
-from liex_lab.simulation import agents
-from liex_lab.simulation._render_kernels import WALL_COLUMNS
+from liex_lab.sessions import Session, evidence
+from liex_lab.simulation import _render_kernels, agents, training_patches
+from liex_lab.simulation.agents import agent
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
-from liex_lab.simulation.agents.agent import (
-    STEP_S,
-    ActedMotion,
-    Individual,
-    draw_camera,
-    render_agent,
-)
 from liex_lab.simulation.species import FishSpecies, MouseSpecies
-from liex_lab.simulation.training_patches import Views
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Subject
@@ -198,8 +188,8 @@ def act(
     size = sizes[scenario.individual]
     n = len(rows)
     if scenario.filmed_s:
-        n = int(np.searchsorted(rows * STEP_S, scenario.filmed_s))
-    times = np.round(rows[:n] * STEP_S * 1e9).astype(np.int64)
+        n = int(np.searchsorted(rows * agent.STEP_S, scenario.filmed_s))
+    times = np.round(rows[:n] * agent.STEP_S * 1e9).astype(np.int64)
     whole = Camera(*camera.intrinsics[0], *(int(x) for x in camera.size_px[0]))
     return AgentTrack(
         tracker.observe(rendered(rng, stage, slice(n), window_px), times, size),
@@ -213,13 +203,13 @@ def act(
 
 
 Staged = tuple[
-    ActedMotion,
+    agent.ActedMotion,
     NDArray[np.int64],
     Pose,
     Array,
     Array | None,
     FishSpecies | MouseSpecies,
-    Views,
+    training_patches.Views,
     BodyShape,
     Array,
 ]
@@ -246,14 +236,14 @@ def rendered(
     """Depth around the animal in some frames of a generated scenario."""
     _, _, pose, girth, walls, species, camera, shape, _ = stage
     near = None if walls is None else walls[rows]
-    return render_agent(rng, species, camera, shape, pose[rows], girth[rows], near, window_px)
+    return agent.render_agent(rng, species, camera, shape, pose[rows], girth[rows], near, window_px)
 
 
 def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
     """A fish in a tank: its motion, poses and camera."""
     species = FishSpecies()
     own = np.random.default_rng([scenario.individual, 0])
-    fish = Individual.draw(own, (25.0 / 30.0, 34.0 / 30.0), scenario.novel)
+    fish = agent.Individual.draw(own, (25.0 / 30.0, 34.0 / 30.0), scenario.novel)
     shape = species.shapes(own, "train", 1)
     assert isinstance(shape, BodyShape)
     height_mm = float(rng.uniform(300.0, 330.0))
@@ -262,7 +252,7 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
     motion = actor.cut(rng, scenario.word) if scenario.word else actor.uncut(rng, scenario.seconds)
     rows = motion.at(scenario.rate_hz)
     pose = fish_acts.fish_poses(rng, species, motion, rows, fish.size)
-    camera = draw_camera(rng, species, species.sensors[0], shape.fur, height_mm, 4)
+    camera = agent.draw_camera(rng, species, species.sensors[0], shape.fur, height_mm, 4)
     girth, wall_mm = np.full(len(rows), fish.size), np.full(len(rows), np.nan)
     return motion, rows, pose, girth, None, species, camera, shape, wall_mm
 
@@ -271,7 +261,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     """A mouse in a box: its motion, poses, girth, camera, and wall distances, mm."""
     species = MouseSpecies()
     own = np.random.default_rng([scenario.individual, 0])
-    mouse = Individual.draw(own, (0.95, 1.3), scenario.novel)
+    mouse = agent.Individual.draw(own, (0.95, 1.3), scenario.novel)
     shape = species.shapes(own, "train", 1)
     half = rng.uniform([290.0, 250.0], [400.0, 330.0])
     actor = mouse_acts.MouseActor.of(mouse, species.skeleton, shape, half)
@@ -280,7 +270,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     pose, girth = mouse_acts.mouse_poses(rng, species, motion, rows, mouse.size, shape)
     middle = pose.joints(species.skeleton)[..., :2].mean(axis=1)
     sensor = species.sensors[int(rng.integers(len(species.sensors)))]
-    camera = draw_camera(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
+    camera = agent.draw_camera(rng, species, sensor, shape.fur, float(rng.uniform(650.0, 850.0)), 1)
     # error of the estimated arena, mm
     wall_mm = (half - np.abs(middle)).min(axis=1) + rng.normal(0.0, 4.0)
     # in some training recordings the walls are unknown
@@ -292,7 +282,7 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
 
 def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
     """The wall nearest to each position (n, 2) mm, as columns (n, WALL_COLUMNS) of the renderer."""
-    walls = np.zeros((len(middle), WALL_COLUMNS))
+    walls = np.zeros((len(middle), _render_kernels.WALL_COLUMNS))
     axis = np.argmin(half - np.abs(middle), axis=1)
     rows = np.arange(len(middle))
     walls[rows, axis] = np.where(middle[rows, axis] < 0, -1.0, 1.0)
@@ -479,7 +469,7 @@ def labelled_sessions(
     for path in sessions:
         session = Session.open(path)
         own = session.bouts[session.bouts["source"] == "human"] if table is None else table
-        track = track_of(session)
+        track = evidence.track_of(session)
         named = session.name if table is not None and session.name in sessions_named(table) else ""
         if table is not None and not named and len(sessions) > 1:
             raise LiexError(
@@ -487,14 +477,16 @@ def labelled_sessions(
                 "session_id (in BORIS: the observation's name)"
             )
         words = words_of(own, (track.times_ns - track.times_ns[0]) * 1e-9, named)
-        if (words == UNLABELLED).all():
+        if (words == ethogram.UNLABELLED).all():
             raise LiexError(
                 f"the session {session.path} has no bout that a person labelled; give them with "
                 "--labels, or correct them in BORIS (`liex export --to boris`)"
             )
         about = session.table("sessions").iloc[0]
         tracks.append(
-            LabelledTrack(track, words, str(about["subject_id"]) or session.name, wall_of(session))
+            LabelledTrack(
+                track, words, str(about["subject_id"]) or session.name, evidence.wall_of(session)
+            )
         )
     return tracks
 
@@ -551,9 +543,9 @@ def suggest(
             f"the action model is for a {recogniser.skeleton}, the session for a {skeleton}; use "
             "another"
         )
-    track = track_of(opened)
+    track = evidence.track_of(opened)
     rows = learning.doubtful_segments(
-        recogniser.recognise(track, wall_of(opened)), track.times_ns, n, least_s
+        recogniser.recognise(track, evidence.wall_of(opened)), track.times_ns, n, least_s
     )
     return pd.DataFrame(rows, columns=["start_s", "stop_s", "guess", "or_else", "uncertainty"])
 

@@ -33,12 +33,11 @@ from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation import simulator
 from liex_lab.simulation.recording import TrueRecording
-from liex_lab.tracking.curve import track_whole
+from liex_lab.tracking import curve, trust
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.smoother import TrackingParameters, tunings_with
 from liex_lab.tracking.track import Subject, Track
 from liex_lab.tracking.tracker import FrameTracker
-from liex_lab.tracking.trust import stretch_of
 
 from ..build import build_scene, plan_of
 from .pose_model import estimator_of
@@ -197,7 +196,7 @@ def observed(
 
 
 def _track(each: Measured, tuning: TrackingParameters | None) -> Track:
-    return track_whole(each.subject, each.observations, (), tuning).track
+    return curve.track_whole(each.subject, each.observations, (), tuning).track
 
 
 def with_motion(tuning: TrackingParameters, **changes: Any) -> TrackingParameters:
@@ -295,7 +294,7 @@ def _claim(each: Measured, plain: TrackingParameters) -> _Claim:
         each.size_spread,
         track.predicted_error_mm[there] / length,
         track.sd_mm[there] / length,
-        stretch_of(1.0, joints) / length,
+        trust.stretch_of(1.0, joints) / length,
         np.abs(joints - each.truth[there]) / length,
     )
 

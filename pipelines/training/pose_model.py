@@ -49,15 +49,12 @@ from liex_lab.estimation.training import (
 )
 from liex_lab.forests.grow import GrowthPlan
 from liex_lab.geometry import SE3
-from liex_lab.runtime.durable import replacing, write_whole
-from liex_lab.runtime.processes import serial_products
+from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.scene import hand_segmenter, height_maps
 from liex_lab.scene.background import SPREADS
-from liex_lab.scene.hand_segmenter import HandPatches
-from liex_lab.scene.height_maps import HeightMaps, Patches, moment_columns, view_of
 from liex_lab.sessions.provenance import package_version
-from liex_lab.simulation import simulator, training_patches
-from liex_lab.simulation.species import GenericSpecies
+from liex_lab.simulation import simulator, species, training_patches
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,8 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
     """
     world = simulator.world_of(skeleton)
     if not (
-        isinstance(world, simulator.BodySimulator) and isinstance(world.species, GenericSpecies)
+        isinstance(world, simulator.BodySimulator)
+        and isinstance(world.species, species.GenericSpecies)
     ):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
     # sizes of a user's own animal, over its home length
@@ -194,12 +192,14 @@ def train_model(
 def _store(path: Path, content: bytes, card: dict[str, Any]) -> None:
     """Write a model, and its card next to it; it gets its name only once both are complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as part:
+    with durable.replacing(path) as part:
         part.write_bytes(content)
-        write_whole(path.with_suffix(".json"), json.dumps(card, indent=1, sort_keys=True) + "\n")
+        durable.write_whole(
+            path.with_suffix(".json"), json.dumps(card, indent=1, sort_keys=True) + "\n"
+        )
 
 
-@serial_products()
+@processes.serial_products()
 def make_model(
     skeleton: Skeleton, method: Method, recipe: Recipe, progress: Progress, draw: int = 0
 ) -> Model:
@@ -234,7 +234,7 @@ def make_model(
     progress(steps - 2, steps, "growing forests: the learned metric")
     metric = train_metric(data, cascade, candidates, rng)
     pruner = train_pruner(data, cascade, candidates, rng)
-    area_mm2 = moment_columns(data.images.moments).area_mm2
+    area_mm2 = height_maps.moment_columns(data.images.moments).area_mm2
     area = float(np.median((area_mm2 / data.size**2)[data.animal]))
     card = {
         "animal": skeleton.name,
@@ -399,7 +399,7 @@ def extract(
     size: Array,
     camera_view: bool,
     n_candidates: int = 1,
-) -> tuple[HeightMaps, Array]:
+) -> tuple[height_maps.HeightMaps, Array]:
     """Height maps of the largest components of the segmentation in each patch, and their cameras.
 
     A hand is segmented by distance (`HandPatches`), every other animal by background subtraction
@@ -415,14 +415,16 @@ def extract(
     """
     origin = windows.origin.astype(float)
     if skeleton.view.foreground == FOREGROUNDS[1]:
-        return HandPatches(windows.depth, windows.intrinsics, origin, skeleton.view).extract(
-            size, camera_view, n_candidates=n_candidates
-        )
+        return hand_segmenter.HandPatches(
+            windows.depth, windows.intrinsics, origin, skeleton.view
+        ).extract(size, camera_view, n_candidates=n_candidates)
     depth, background = (
         image if windows.unit_mm == 1.0 else image * np.float32(windows.unit_mm)
         for image in (windows.depth, windows.background)
     )
-    cut = Patches(depth, background, windows.intrinsics, origin, windows.floor, skeleton.view)
+    cut = height_maps.Patches(
+        depth, background, windows.intrinsics, origin, windows.floor, skeleton.view
+    )
     # of an animal from above, about; only ranks the blobs of a window
     # of home-sized animals from above, if it differs from the home pose's
     home_mm2 = {"mouse": 1070.0}.get(skeleton.name) or Surface.of(skeleton).area_mm2
@@ -436,7 +438,7 @@ def with_truth(
     skeleton: Skeleton,
     method: Method,
     windows: training_patches.TrainingPatches,
-    crops: HeightMaps,
+    crops: height_maps.HeightMaps,
     crop_cameras: Array,
 ) -> TrainingSet:
     """Training images of segmented blobs, labelled as animal or other object by the true pose.
@@ -456,7 +458,7 @@ def with_truth(
     Returns:
         The remaining images, poses in their view frames, mm.
     """
-    T_view_camera = view_of(crop_cameras)
+    T_view_camera = height_maps.view_of(crop_cameras)
     pose = Pose(T_view_camera @ windows.root, windows.angles, windows.scale)
     frames = pose.frames(skeleton)
     joints = frames.translation

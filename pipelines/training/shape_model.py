@@ -20,8 +20,7 @@ from liex_lab.body.shape import BodyShape
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.session_shape import PLACES, ShapePrior, labels_of, session_clues
-from liex_lab.runtime.durable import replacing
-from liex_lab.runtime.processes import serial_products
+from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import HeightMaps, view_of
 from liex_lab.simulation import simulator, training_patches
@@ -35,7 +34,7 @@ _LEAST_GOOD = 8  # frames per mini-session
 MiniSession = tuple[Array, Array]  # clues (F,), see `session_clues`; labels (K,), see `ShapePrior`
 
 
-@serial_products()
+@processes.serial_products()
 def train_shape(
     animal: str,
     out: Path,
@@ -67,7 +66,7 @@ def train_shape(
     prior = ShapePrior.fit(*(np.stack(part) for part in zip(*rows, strict=True)))
     others = list(mini_sessions(estimator, "other", known // 4, progress))
     prior = replace(prior, unseen=left_over(prior, others), model=estimator.model.fingerprint)
-    with replacing(out) as part:
+    with durable.replacing(out) as part:
         np.savez(part, **prior.arrays())  # type: ignore[arg-type]
     return out
 

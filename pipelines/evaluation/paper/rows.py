@@ -24,23 +24,15 @@ from liex_lab.baselines.baseline import (
     second_is_likelier,
 )
 from liex_lab.body.skeleton import Array, Skeleton
+from liex_lab.estimation import estimator, training
 from liex_lab.estimation.cascade import N_DIRECTIONS, Candidates, Cascade, TrainingSet
-from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import Method, method_of
 from liex_lab.estimation.model import Model
-from liex_lab.estimation.training import (
-    joint_error,
-    run_on,
-    start_candidates,
-    train_cascade,
-    train_metric,
-)
 from liex_lab.evaluation.scores import PoseErrors, interval95, plain, rank_correlation
 from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.scene._height_map_kernels import CropCamera
-from liex_lab.scene.height_maps import HeightMaps, Patches, Segmenter, in_camera_frame, view_of
+from liex_lab.scene import _height_map_kernels, height_maps
 from liex_lab.simulation.recording import TrueRecording
 
 from ...build import build_scene, plan_of
@@ -75,14 +67,14 @@ def runs_of(animal: str, variant: str, progress: Progress = silent) -> list[Subj
     )
 
 
-def runs_of_models(variant: str, models: Sequence[PoseEstimator]) -> list[Subject]:
+def runs_of_models(variant: str, models: Sequence[estimator.PoseEstimator]) -> list[Subject]:
     """The runs of a row of the paper's variant, from one estimator per training draw."""
     if variant == "paper":
         return list(models)
     if variant == "paper-no-metric":
         return [PlainMean(one) for one in models]
     return [
-        PoseEstimator(one.model, 1, start_seed=START_DRAWS * k + draw)
+        estimator.PoseEstimator(one.model, 1, start_seed=START_DRAWS * k + draw)
         for k, one in enumerate(models)
         for draw in range(START_DRAWS)
     ]
@@ -106,8 +98,8 @@ class CommonView:
 
 
 def common_view(
-    recording: TrueRecording, plan: Plan, chooser: PoseEstimator
-) -> tuple[Segmenter, NDArray[np.float32], CommonView]:
+    recording: TrueRecording, plan: Plan, chooser: estimator.PoseEstimator
+) -> tuple[height_maps.Segmenter, NDArray[np.float32], CommonView]:
     """Process a recording as `liex run` would, up to the pose.
 
     Args:
@@ -128,9 +120,11 @@ def common_view(
     return scene, frames, CommonView(size, second, wrong, wrong_alone)
 
 
-def is_other(crops: HeightMaps, crop_cameras: Array, recording: TrueRecording) -> NDArray[np.bool_]:
+def is_other(
+    crops: height_maps.HeightMaps, crop_cameras: Array, recording: TrueRecording
+) -> NDArray[np.bool_]:
     """Whether (n,) a component is another object than the animal, by its centroid."""
-    T = view_of(crop_cameras)
+    T = height_maps.view_of(crop_cameras)
     joints = SE3(T.rotation[:, None], T.translation[:, None]) @ recording.joints_camera
     blob = crops.blobs
     centroid = np.stack(
@@ -143,9 +137,9 @@ def is_other(crops: HeightMaps, crop_cameras: Array, recording: TrueRecording) -
 def measured(
     subject: Subject,
     frames: NDArray[np.float32],
-    scene: Segmenter,
+    scene: height_maps.Segmenter,
     view: CommonView,
-    cut: dict[tuple[float, bool], tuple[HeightMaps, Array]],
+    cut: dict[tuple[float, bool], tuple[height_maps.HeightMaps, Array]],
 ) -> tuple[Array, Array, Array]:
     """Joints, predicted errors and their interval of one subject on the common choice of object.
 
@@ -160,8 +154,8 @@ def measured(
         As `pose.unpacked`: joints (n, J, 3) mm, camera frame; predicted error (n,) mm; factors
         (2,).
     """
-    answer: Callable[..., Estimates | Guesses]
-    if isinstance(subject, PoseEstimator):
+    answer: Callable[..., estimator.Estimates | Guesses]
+    if isinstance(subject, estimator.PoseEstimator):
         method, answer = subject.model.method, subject.best_of
         sized, camera_view = method.session_size, method.camera_view
     else:
@@ -175,7 +169,7 @@ def measured(
 def measured_rows(
     animal: str,
     runs: Mapping[str, Sequence[Subject]],
-    chooser: PoseEstimator,
+    chooser: estimator.PoseEstimator,
     tests: Tests,
     progress: Progress,
 ) -> dict[str, dict[str, Any]]:
@@ -476,11 +470,11 @@ def sensitivity(
         cascade, metric = base, base_metric
         if number == "metric trees" and changed != method:
             rng = np.random.default_rng(recipe.seed + 1)
-            metric = train_metric(data, replace(base, method=changed), candidates, rng)
+            metric = training.train_metric(data, replace(base, method=changed), candidates, rng)
         elif number != INITIAL_POSES and changed != method:
             cascade, _, metric = _train(data, skeleton, changed, recipe.seed)
         model = Model(replace(cascade, method=changed), metric, None, {})
-        run = run_on(model, test, np.random.default_rng(recipe.seed))
+        run = training.run_on(model, test, np.random.default_rng(recipe.seed))
         error = run.joint_error.mean(axis=1)
         curves[number].append(
             {"value": value, "mean_mm": float(error.mean()), "median_mm": float(np.median(error))}
@@ -507,8 +501,10 @@ def _train(
 ) -> tuple[Cascade, Candidates, Any]:
     """A small cascade, the final state of its training candidates, and its learned metric."""
     rng = np.random.default_rng(seed)
-    cascade, candidates = train_cascade(data, skeleton, method, rng, lambda share, what: None)
-    return cascade, candidates, train_metric(data, cascade, candidates, rng)
+    cascade, candidates = training.train_cascade(
+        data, skeleton, method, rng, lambda share, what: None
+    )
+    return cascade, candidates, training.train_metric(data, cascade, candidates, rng)
 
 
 def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
@@ -528,7 +524,9 @@ def illustrate(model: Model, n_images: int = 128) -> dict[str, Any]:
         k = min(k, N_DIRECTIONS * forest.n_trees)
         proposals = forest, np.zeros((forest.n_trees, n), np.bool_)  # no tree saw them
     method_k = replace(method, training_candidates=k)
-    candidates = start_candidates(data, skeleton, method_k, np.random.default_rng(0), proposals)
+    candidates = training.start_candidates(
+        data, skeleton, method_k, np.random.default_rng(0), proposals
+    )
     names, errors, positions = _follow(model.cascade, data, candidates)
     samples = model.cascade.metric_samples(data.images, candidates)
     scores = model.cascade.predict(model.metric, samples)[:, 0].astype(float).reshape(n, k)
@@ -588,7 +586,7 @@ def _follow(
         for joint in left:
             cascade.place(candidates, joint)  # straight on from its parent's current position
         names.append(name)
-        errors.append(joint_error(candidates, data.truth))
+        errors.append(training.joint_error(candidates, data.truth))
         positions.append(candidates.positions.copy())
 
     note("start")
@@ -601,9 +599,9 @@ def _follow(
 def _pixels(positions: Array, data: TrainingSet, image: int) -> Array:
     """Columns and rows (m, J, 2) of joints (m, J, 3) of one image's view in its height map."""
     packed = data.images.crop_cameras[image]
-    camera = CropCamera(*packed)
+    camera = _height_map_kernels.CropCamera(*packed)
     x, y, z = np.moveaxis(
-        in_camera_frame(positions, np.repeat(packed[None], len(positions), 0)), -1, 0
+        height_maps.in_camera_frame(positions, np.repeat(packed[None], len(positions), 0)), -1, 0
     )
     uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
     return (uv - [camera.u0, camera.v0]) / camera.step
@@ -657,7 +655,7 @@ def _key_frames(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _visible_points(patches: Patches, k: int, T_arena_camera: SE3) -> Array:
+def _visible_points(patches: height_maps.Patches, k: int, T_arena_camera: SE3) -> Array:
     """Points of patch k above the ground, (m, 3) mm, arena frame."""
     depth = patches.depth[k].astype(float)
     # a pixel less than 4 mm above the empty ground is noise
