@@ -14,7 +14,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 
 MOUSE = Skeleton.load("mouse")
-NAMES = motion.NAMES
+NAMES = ("TTI", "Trunk", "Spine", "Neck", "Nose")
 
 
 def back(bend: float = 0.0, rise: float = 0.0, turn: float = 0.0, nod: float = 0.0) -> np.ndarray:
