@@ -148,7 +148,7 @@ def acted(
         group = [scenarios[k] for k in rows]
         animal = group[0].animal
         key = hashlib.sha256((repr(group) + made_by).encode() + _generator(animal)).hexdigest()[:16]
-        path = cache_folder() / "acted" / f"{animal}-observed-{key}.npz"
+        path = cache_folder() / "acted" / f"{animal}-tracks-{key}.npz"
         if not path.is_file():
             sizes: dict[int, float] = {}
             measured: list[AgentTrack] = []
@@ -312,8 +312,8 @@ def _save(path: Path, group: list[AgentTrack]) -> None:
             "animal": one.animal,
             "lens": [camera.fx, camera.fy, camera.cx, camera.cy],
             "pixels": [camera.width, camera.height],
-            "turn": one.subject.T_arena_camera.rotation,
-            "shift": one.subject.T_arena_camera.translation,
+            "camera_turn": one.subject.T_arena_camera.rotation,
+            "camera_shift": one.subject.T_arena_camera.translation,
             "size": one.subject.length_mm / one.observations.skeleton.length,
         }
         columns |= {f"{name} {k}": value for name, value in known.items()}
@@ -332,7 +332,7 @@ def _load(path: Path, estimator: PoseEstimator, group: Sequence[Scenario]) -> li
             lens, pixels, turn, shift, size, words, animal, wall_mm, truth = (
                 data[f"{name} {k}"]
                 for name in (
-                    *("lens", "pixels", "turn", "shift", "size"),
+                    *("lens", "pixels", "camera_turn", "camera_shift", "size"),
                     *("words", "animal", "wall_mm", "truth"),
                 )
             )
