@@ -12,10 +12,10 @@ export class Doubts {
     this.reviewed = new Set(JSON.parse(kept(this.keep) || "[]"));
     this.list = make("ol", { class: "desk-doubts" });
     this.count = make("span", { class: "muted" });
-    this.parts = [make("h3", {}, "Places in doubt ", this.count),
-      make("div", { class: "desk-bar" }, button("◀", "P", () => this.next(-1), { "aria-label": "previous place in doubt" }),
-        button("Next in doubt", "N", () => this.next(1), { class: "main" }),
-        button("Right as it is", "K", () => this.right())),
+    this.parts = [make("h3", {}, "Doubtful frames ", this.count),
+      make("div", { class: "desk-bar" }, button("◀", "P", () => this.next(-1), { "aria-label": "previous doubtful frame" }),
+        button("Next doubtful", "N", () => this.next(1), { class: "main" }),
+        button("Correct as is", "K", () => this.right())),
       this.list];
   }
 
@@ -76,7 +76,7 @@ export class Doubts {
   }
 
   right() {
-    if (!this.here) { this.desk.notify("go to a place in doubt first, with N"); return; }
+    if (!this.here) { this.desk.notify("go to a doubtful frame first, with N"); return; }
     this.done(this.here);
     this.next(1);
   }

@@ -4,7 +4,7 @@ export const KEYS = [
   ["space", "play or pause"], ["← →", "one frame; with Shift one second"], ["↑ ↓", "bout before, bout after"],
   [", .", "slower, faster"], ["1 to 9", "name the bout here, or the marked span; with Shift from the tenth on"], ["0", "take the bout's name away"],
   ["[ ]", "mark a span from here, to here; Esc clears it"], ["F", "exchange head and tail in the span, or here"],
-  ["N P", "next, previous place in doubt"], ["K", "it is right as it is: next"],
+  ["N P", "next, previous doubtful frame"], ["K", "correct as is: next"],
   ["X", "next crossing: ends or animals taken for one another; with Shift the one before"], ["U R", "take back; make again what was taken back"],
   ["+ − Z", "zoom in, out; all of the image"], ["S", "skeleton on, off"],
 ];

@@ -381,8 +381,8 @@ def test_a_size_that_no_camera_or_frame_has_is_refused(
         ((b"16zT", b"JPEG"), "the code 'JPEG'"),
         ((b"xnMapOutputMode", b"xnMapOutputXxxx"), "does not state the size"),
         ((b"NI10", b"NI20"), "something else"),
-        ((b"NI10\1\0\1\0", b"NI10\1\0\2\0"), "of version 1.0.2.0"),
-        ((b"NI10\1\0\1\0\0", b"NI10\1\0\0\0\3"), "of version 1.0.0.3"),
+        ((b"NI10\1\0\1\0", b"NI10\1\0\2\0"), "states version 1.0.2.0"),
+        ((b"NI10\1\0\1\0\0", b"NI10\1\0\0\0\3"), "states version 1.0.0.3"),
         (
             (struct.pack("<i", DEPTH) + b"16zT", struct.pack("<i", COLOUR) + b"16zT"),
             "its nodes are Depth",
