@@ -336,18 +336,14 @@ def test_where_chance_leaves_no_choice_there_is_no_p() -> None:
     assert np.isnan(_binomial(3, 5, 1.0))
 
 
-RUN = (
-    "from liex_lab.api import run_session; from liex_lab.plan import Plan;"
-    "run_session('synthetic:walk?seed=3&frames=40&sensor=primesense-qvga&spine_mm=70',"
-    " Plan.load('mouse'), tempfile.mkdtemp())"
-)
+RUN = "from liex_lab.api import run_demo; run_demo(tempfile.mkdtemp())"
 
 
 @pytest.mark.parametrize(
     "work",
     [
         "import liex_lab.api, liex_lab.pipelines.session, liex_lab.behaviour.summary",
-        pytest.param(RUN, marks=pytest.mark.nightly),
+        pytest.param(RUN, id="run", marks=pytest.mark.nightly),
     ],
 )
 def test_a_run_does_without_the_statistics_of_scipy(work: str) -> None:

@@ -38,9 +38,10 @@ def session(recording: Path) -> Session:
 def test_the_last_lines_and_the_table_of_a_study_report_both(
     recording: Path, tmp_path: Path
 ) -> None:
+    (tmp_path / recording.name).symlink_to(recording)
     (tmp_path / "study.toml").write_text(
         'name = "two"\n[[animals]]\nid = "m1"\ngroup = "a"\n'
-        f'[[sessions]]\nanimal = "m1"\nsession = "01"\nrecording = "{recording}"\n'
+        f'[[sessions]]\nanimal = "m1"\nsession = "01"\nrecording = "{recording.name}"\n'
     )
     result = CliRunner().invoke(cli.app, ["cohort", str(tmp_path / "study.toml"), "--workers", "1"])
     assert result.exit_code == 0, result.output

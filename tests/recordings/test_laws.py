@@ -207,7 +207,7 @@ def test_large_files_are_read_in_parts_and_memory_does_not_grow_with_length(
     form: Format, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # enough for a file that must not be read at once; fewer where every image has one of its own
-    many = depth_frames(300 if form.streams else 24)
+    many = depth_frames(300 if form.streams else 48)
     genuine, quarter, peaks = io.open, len(many) // 4, []
 
     def open_bounded(file: Any, mode: str = "r", *rest: Any, **more: Any) -> Any:
