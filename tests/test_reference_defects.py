@@ -133,7 +133,11 @@ def test_and_through_a_bent_lens(tmp_path: Path, camera: Camera, lens: Distortio
             marks=pytest.mark.nightly,
         ),
         (PRIMESENSE_QVGA, Water(400.0, 1.34, 0.04, -0.03, "structured_light")),
-        (replace(KINECT_V2, distortion=BARREL), Water(400.0, ranging="light_field")),
+        pytest.param(
+            replace(KINECT_V2, distortion=BARREL),
+            Water(400.0, ranging="light_field"),
+            marks=pytest.mark.nightly,
+        ),
     ],
     ids=["time of flight", "structured light", "tilted", "bent lens and light field"],
 )

@@ -185,8 +185,8 @@ def evaluate_pose(
         raise LiexError(
             f"there is no split '{split}' to measure poses on; known are {', '.join(world.splits)}"
         )
-    sessions = world.test_split(split, spine_mm=spine_mm)
     subject = subject_of(animal, variant, progress, model)
+    sessions = world.test_split(split, spine_mm=spine_mm)
     if n_frames is not None:
         sessions = sessions[: max(1, -(-n_frames // len(sessions[0])))]
     errors = errors_of(subject, sessions, plan_of(animal), progress)

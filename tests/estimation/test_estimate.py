@@ -38,7 +38,7 @@ def columns(estimates: Estimates) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("variant", [*VARIANTS, "seen"])
+@pytest.mark.parametrize("variant", [*VARIANTS, pytest.param("seen", marks=pytest.mark.nightly)])
 def test_all_candidates_agree_with_the_slow_twin_of_algorithm_1(variant):
     model, size = trained(variant).model, 1.0 if variant == "paper" else 1.07
     estimator = PoseEstimator(model)

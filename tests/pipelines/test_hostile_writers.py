@@ -170,6 +170,7 @@ def test_figures_and_videos_stay_in_their_folder(name: str, tmp_path: Path) -> N
         assert place.name == safe_name(place.name)
 
 
+@pytest.mark.nightly
 def test_no_writer_follows_a_link_in_its_folder(measured: Session, root: Path) -> None:
     out = root / "a" / "b" / "out"
     precious = root / "prec" / "precious"

@@ -157,7 +157,9 @@ def test_splits_are_fixed_halved_between_sensors_and_apart() -> None:
             assert np.linalg.norm(item[:, None] - body, axis=-1).min() > 4.0
 
 
-@pytest.mark.parametrize("animal", ["mouse", "fish", "hand"])
+@pytest.mark.parametrize(
+    "animal", ["mouse", *(pytest.param(a, marks=pytest.mark.nightly) for a in ("fish", "hand"))]
+)
 def test_other_cameras_have_a_focal_length_outside_the_training(animal: str) -> None:
     world = world_of(Skeleton.load(animal))
     sensors = world.species.sensors if isinstance(world, BodySimulator) else (NYU_SENSOR, *SENSORS)

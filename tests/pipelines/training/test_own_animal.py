@@ -36,8 +36,8 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         survivors=0,
         pruner=None,
         corrector=None,
-        regressors=replace(default.regressors, n_trees=5, max_depth=12, n_tests=50),
-        metric=replace(default.metric, n_trees=16, max_depth=7, n_tests=40),
+        regressors=default.regressors._replace(n_trees=5, max_depth=12, n_tests=50),
+        metric=default.metric._replace(n_trees=16, max_depth=7, n_tests=40),
     )
     monkeypatch.setitem(methods.METHODS, "default", small)
 
