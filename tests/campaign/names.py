@@ -33,5 +33,7 @@ def names() -> Tally:
     """Every writer with every name; nothing is written outside of the folder that was named."""
     os.environ["LIEX_ALL_NAMES"] = ""  # every writer meets every name
     counting = _Counting()
-    pytest.main(["-q", "--no-header", "-p", "no:cacheprovider", str(_LAWS)], plugins=[counting])
+    pytest.main(
+        ["-q", "--no-header", "-p", "no:cacheprovider", "-m", "", str(_LAWS)], plugins=[counting]
+    )
     return counting.tally

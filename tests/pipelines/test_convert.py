@@ -127,7 +127,7 @@ def test_depth_that_16_bits_do_not_keep_is_refused_rounded_or_kept_as_floats(
     assert any("32-bit metres" in note for note in done.notes)
     with open_recording(source) as before, open_recording(tmp_path / "new.mcap") as after:
         np.testing.assert_allclose([f.depth for f in after], [f.depth for f in before], rtol=1.2e-7)
-    with pytest.raises(RecordingError, match="leave it out"):
+    with pytest.raises(RecordingError, match="leave out --step-mm"):
         convert(source, tmp_path / "other.mcap", step_mm=0.1)
 
 
