@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,6 +43,10 @@ _LONGEST = tuple(
         "pipelines/test_doctor",
     )
 )
+
+# the processes that tests start import the program again and again: let them keep its bytecode
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 settings.register_profile("suite", derandomize=True, deadline=None, max_examples=50, database=None)
 settings.load_profile("suite")

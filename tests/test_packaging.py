@@ -13,8 +13,7 @@ from tests.conftest import REPOSITORY
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
 SETUP = PROJECT["tool"]["setuptools"]
 TEST_LINE = (
-    "python3 -m venv .venv && .venv/bin/pip install -q --no-compile -e '.[test]' && "
-    ".venv/bin/python -m pytest"
+    "python3 -m venv .venv && .venv/bin/pip install -q -e '.[test]' && .venv/bin/python -m pytest"
 )
 DEMO_LINE = "python3 -m venv .venv && .venv/bin/pip install . && .venv/bin/liex demo"
 
