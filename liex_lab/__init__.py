@@ -34,6 +34,7 @@ _HOMES = {
     "SE3": "liex_lab.geometry",
     "Session": "liex_lab.sessions",
     "Skeleton": "liex_lab.body",
+    "import_points": "liex_lab.api",
     "open_recording": "liex_lab.recordings",
     "run_session": "liex_lab.api",
 }
@@ -47,12 +48,13 @@ __all__ = [
     "Session",
     "Skeleton",
     "__version__",
+    "import_points",
     "open_recording",
     "run_session",
 ]
 
 if TYPE_CHECKING:
-    from liex_lab.api import run_session
+    from liex_lab.api import import_points, run_session
     from liex_lab.body import Skeleton
     from liex_lab.errors import LiexError
     from liex_lab.estimation.estimator import PoseEstimator

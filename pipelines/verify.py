@@ -76,7 +76,7 @@ def verify_session(
         *_provenance(opened),
         *_files(opened),
         *_logs(opened),
-        *_model(opened),
+        *(() if opened.metadata.get("imported") else _model(opened)),
         *_corrections(opened),
     ]
     return [*found, *_again(opened, str(recording), progress)] if recording else found
@@ -85,7 +85,10 @@ def verify_session(
 def _provenance(session: Session) -> Iterator[Finding]:
     """Whether session.json has all that is needed to reproduce the session."""
     missing = [
-        name for name in _NEEDED if value_at(session.metadata, name.split(".")) in (None, "", {})
+        name
+        for name in _NEEDED
+        if value_at(session.metadata, name.split(".")) in (None, "", {})
+        and not (name == "model.sha256" and session.metadata.get("imported"))
     ]
     if missing:
         yield Finding(

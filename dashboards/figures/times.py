@@ -112,14 +112,16 @@ def curves(
     """
     first_s, last_s = span_s or (0.0, animal.duration_s)
     error = animal.frames["predicted_error_mm"]
-    n = int(error.notna().sum())
     rows: list[tuple[str, str, Array, str, bool]] = []
     for one in drawn_curves(animal):
         values, unit = shown(animal.column(one.column), one.unit)
         rows.append((f"{one.title} {one.what}", unit, values, one.colour, one.from_zero))
-    rows.append(("Predicted error of a joint", "mm", animal.broken(error), PREDICTED_ERROR, True))
+    if error.notna().any():
+        values = animal.broken(error)
+        rows.append(("Predicted error of a joint", "mm", values, PREDICTED_ERROR, True))
     if not any(np.isfinite(values).any() for _, _, values, _, _ in rows):
         return None
+    n = int(error.notna().sum() or np.isfinite(rows[0][2]).sum())
     step = _CURVE_MM + 6.0
     figure = sheet(width_mm, len(rows) * step + 8.0)
     width = width_mm - LEFT_MM - RIGHT_MM

@@ -7,7 +7,7 @@ Rules name the actions of a mouse (rear, run, walk, pause) by double thresholds 
 one label per frame, half-open bouts, never across a gap. For every action: hysteresis (two
 thresholds, enter and leave), then interruptions shorter than `merge_pauses_s` are bridged, then
 bouts shorter than `min_bout_s` are dropped. If two actions claim a frame, the first of `ACTIONS`
-wins. Default thresholds: Live Mouse Tracker (de Chaumont et al. 2019).
+wins. Default speeds: Live Mouse Tracker (de Chaumont et al. 2019).
 """
 
 from __future__ import annotations
@@ -375,14 +375,15 @@ Mask = NDArray[np.bool_]
 class MouseRules(BehaviourThresholds):
     """Thresholds of the rule-based ethogram, by their names in a plan.
 
-    `MouseRules(**plan.behaviour.model_dump())` makes them from a plan. The defaults are those of
-    Live Mouse Tracker. Its rearing height of 40 mm applies to an adult of about 90 mm; a smaller
-    animal rears from 0.6 of its own length. A bout of rearing extends down to two thirds of that
-    height.
+    `MouseRules(**plan.behaviour.model_dump())` makes them from a plan. Speeds and the height of
+    40 mm are those of Live Mouse Tracker; an animal shorter than 100 mm rears from 0.4 of its own
+    length, as in the definitions of `actions.vocabulary`. A bout of rearing extends down to half of
+    that height. Heights are above the usual one of the tail's base, which errs less than that of
+    one frame.
     """
 
     def rear_mm(self, spine_mm: float) -> float:
-        """Least height of the nose above the tail's base in a rear, mm, for a spine of
+        """Least height of the nose above the tail's base in a rear, mm, for a length of
         `spine_mm`.
         """
         return min(self.rear_height_mm, self.rear_height_bl * spine_mm)
@@ -393,8 +394,8 @@ class MouseRules(BehaviourThresholds):
         run = f"{self.run_above_mm_s / 10.0:g} cm/s"
         return {
             "rear": (
-                f"the nose is {self.rear_height_mm:g} mm or more above the tail's base, or "
-                f"{self.rear_height_bl:g} body lengths for an animal shorter than "
+                f"the nose is {self.rear_height_mm:g} mm or more above the usual height of the "
+                f"tail's base, or {self.rear_height_bl:g} body lengths for an animal shorter than "
                 f"{self.rear_height_mm / self.rear_height_bl:.0f} mm; rising and descending "
                 f"belong to it, down to {self.rear_leave:.0%} of that height"
             ),
@@ -450,11 +451,10 @@ def raw_labels(
         rules: the thresholds.
     """
     speed = kinematics["speed_mm_s"].to_numpy(float)
-    slope = (
-        kinematics["nose_over_rump_mm"].to_numpy(float)
-        if "nose_over_rump_mm" in kinematics
-        else speed * np.nan
-    )
+    raised = speed * np.nan
+    if "nose_over_rump_mm" in kinematics:
+        nose = kinematics["nose_height_mm"].to_numpy(float)
+        raised = nose - of_known(np.median, nose - kinematics["nose_over_rump_mm"].to_numpy(float))
     rear_mm = rules.rear_mm(spine_mm)
     low = 1.0 - rules.speed_hysteresis
     high = 1.0 + rules.speed_hysteresis
@@ -462,7 +462,7 @@ def raw_labels(
     running = hysteresis(speed, rules.run_above_mm_s * high, rules.run_above_mm_s * low, number)
     known = np.isfinite(speed)
     return {
-        "rear": hysteresis(slope, rear_mm, rules.rear_leave * rear_mm, number),
+        "rear": hysteresis(raised, rear_mm, rules.rear_leave * rear_mm, number),
         "run": running & known,
         "walk": moving & ~running & known,
         "pause": ~moving & known,

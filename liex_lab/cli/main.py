@@ -25,6 +25,7 @@ from liex_lab.cli.options import (
     START,
     STUDIES,
     JsonFile,
+    NamesFile,
     OutFolder,
     PlanName,
     RecordingPath,
@@ -71,6 +72,8 @@ app = command_group(
 )
 app.add_typer(evaluate, name="evaluate", rich_help_panel=MODELS)
 app.add_typer(correct, name="correct", rich_help_panel=SESSIONS)
+imports = command_group("Make sessions from the results of other programs.")
+app.add_typer(imports, name="import", rich_help_panel=RECORDINGS)
 for command, section in (
     (describe, SESSIONS),
     (report, SESSIONS),
@@ -184,6 +187,43 @@ def run(
         if one.session is not None:
             codes.append(_print_session(one.session))
     raise typer.Exit(max(codes))
+
+
+@imports.command("points")
+def import_points(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="3D points, .csv, .nc, .mat or .npz.")
+    ],
+    plan: PlanName = "mouse",
+    names: NamesFile = None,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frame rate of a file without times.")
+    ] = None,
+    individual: Annotated[
+        str | None, typer.Option("--individual", metavar="NAME", help="The animal to read.")
+    ] = None,
+    out: OutFolder = Path(),
+    settings: Settings = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an existing session.")
+    ] = False,
+) -> None:
+    """Make a session from 3D points of another program (Anipose, DANNCE, movement, CSV).
+
+    It has poses, behaviour tables, a replay and a report; what needs depth is absent.
+    """
+    with progress_bar() as progress:
+        session = api.import_points(
+            file,
+            load_plan(plan, settings or []),
+            out,
+            names=names,
+            fps=fps,
+            individual=individual,
+            overwrite=overwrite,
+            progress=progress,
+        )
+    raise typer.Exit(_print_session(session))
 
 
 @app.command(rich_help_panel=START)

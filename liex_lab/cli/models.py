@@ -12,6 +12,7 @@ from liex_lab import api
 from liex_lab.cli.options import (
     AnimalName,
     JsonFile,
+    NamesFile,
     RowName,
     SessionPath,
     VariantName,
@@ -339,6 +340,15 @@ def evaluate_actions(
         Path | None,
         typer.Option("--out", metavar="DIR", help="Draw confusion matrices into this folder."),
     ] = None,
+    tracks: Annotated[
+        Path | None,
+        typer.Option(
+            "--tracks",
+            metavar="FOLDER",
+            help="Score rules and recognisers against people's words in 3D points of real mice.",
+        ),
+    ] = None,
+    names: NamesFile = None,
     *,
     progress: Progress,
 ) -> Result:
@@ -346,8 +356,11 @@ def evaluate_actions(
 
     The recordings are rendered and measured first, which takes about half an hour for all 30
     minutes on two cores. Measured recordings are kept in the cache folder (LIEX_CACHE), so that a
-    stopped job resumes where it was.
+    stopped job resumes where it was. With --tracks nothing is rendered, and all other options but
+    --names are ignored.
     """
+    if tracks is not None:
+        return api.evaluate_tracks(tracks, names=names, progress=progress)
     return api.evaluate_actions(
         animal,
         model=model,

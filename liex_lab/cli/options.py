@@ -31,6 +31,12 @@ WhichPlan = Annotated[
         "--plan", help="A bundled plan or a .toml file; default: the bundled plan that fits."
     ),
 ]
+NamesFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--names", metavar="TOML", help="Which point is which joint, unit, upward axis and floor."
+    ),
+]
 OutFolder = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="Output folder, in which NAME.liex is created.")
 ]
@@ -192,7 +198,7 @@ _OF_WORK = (
     *("demo", "doctor", "run", "show"),
     *("report", "figures", "correct", "describe", "suggest", "export", "verify"),
     *("cohort", "compare", "dashboard"),
-    *("convert", "pack", "live"),
+    *("import", "convert", "pack", "live"),
     *("info", "train", "evaluate"),
 )
 

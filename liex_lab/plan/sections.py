@@ -450,13 +450,17 @@ class BehaviourThresholds(SettingsTable):
         3000.0, description="faster movements are errors of measurement"
     )
     rear_height_mm: Positive = Field(
-        40.0, description="rearing begins when the nose is this much higher than the tail base ..."
+        40.0,
+        description=(
+            "rearing begins when the nose is this far above the tail base's usual (median) height "
+            "..."
+        ),
     )
     rear_height_bl: Positive = Field(
-        0.6, description="... or, for a smaller animal, by this many body lengths"
+        0.4, description="... or, for a smaller animal, by this many body lengths"
     )
     rear_leave: Positive = Field(
-        2.0 / 3.0, le=1, description="rearing ends when the nose is below this share of that height"
+        0.5, le=1, description="rearing ends when the nose is below this share of that height"
     )
     speed_hysteresis: NotNegative = Field(
         0.1,

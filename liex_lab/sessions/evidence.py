@@ -189,8 +189,12 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
     """
     if not session.has(FILE):
         raise SessionError(
-            f"{session.path} lacks the observations of single frames ({FILE}), as sessions of "
-            "earlier versions do; run `liex run` on the recording again"
+            f"{session.path} lacks the observations of single frames ({FILE}), "
+            + (
+                "since its poses are imported points; correct these points and import them again"
+                if session.metadata.get("imported")
+                else "as sessions of earlier versions do; run `liex run` on the recording again"
+            )
         )
     with _opened(session) as arrays:
         facts = json.loads(arrays["subject"].tobytes())

@@ -224,6 +224,15 @@ class SessionWriter:
                 self._save_checkpoint()
         self._seconds += time.perf_counter() - began
 
+    def add_times(self, times_ns: NDArray[np.int64]) -> None:
+        """Add consecutive frames without depth, such as those of imported points.
+
+        Args:
+            times_ns: (n,) their times, ns.
+        """
+        self._index.extend(range(self.n_frames, self.n_frames + len(times_ns)))
+        self._times_ns.extend(times_ns.tolist())
+
     def observations(self, kind: Callable[..., Kept]) -> Kept:
         """The observations of all frames so far, as passed to `add`, from disk.
 

@@ -12,12 +12,16 @@ it, and scores two recognisers on individuals that neither was trained on:
   at 100 Hz; a decision tree on speed alone as the lower bound; time for an hour's track;
 - number of their bouts that contradict the printed definition of their action, with and without the
   check of `liex run`.
+
+With `--tracks` it scores words against those of people in 3D points of real mice instead, by
+`TRACKS_PROTOCOL`.
 """
 
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +40,20 @@ from liex_lab.actions.labels import (
     confusion,
     interval95,
     timeline_scores,
+    words_of,
 )
 from liex_lab.actions.timeline import TimelineModel
 from liex_lab.behaviour.bouts import measure_bouts, recognise
 from liex_lab.behaviour.kinematics import Joints, kinematics
+from liex_lab.behaviour.summary import measure_rows
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
+from liex_lab.exchange.points import READERS, PointNames, read_points
+from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.tables.rows import Rows, bout_rows
 
+from ..points import check_track, track_of_points
 from ..training.action_model import (
     FAST_HZ,
     N_USUAL,
@@ -52,6 +62,7 @@ from ..training.action_model import (
     acted,
     acted_tracks,
     cut_sequences,
+    read_any_labels,
     test_recordings,
     train_actions,
     training_recordings,
@@ -400,6 +411,174 @@ def _speeds(tracks: Sequence[LabelledTrack], clock_hz: float) -> tuple[Array, ND
             speeds.append(segment.values[:, [column]])
             words.append(one.words[row])
     return np.concatenate(speeds), np.concatenate(words)
+
+
+TRACKS_PROTOCOL = (
+    "3D points of {n_recordings} recordings of {n_animals} animals, placed on our joints as by "
+    "`liex import points`. Frame-wise F1 = 2 hits / (found + true), summed over the frames that a "
+    "person gave a word; macro_f1: mean over the person's words. rules: the thresholds of "
+    "[behaviour]; bundled: the recogniser trained on virtual mice. taught: a recogniser trained by "
+    "these labels on all other animals, which names each frame by the most probable of the "
+    "person's words; without_z: the same without heights. Intervals: 95 %, by bootstrap over "
+    "recordings ({n_draws} draws), of a single animal over its minutes."
+)
+_WORDS = {  # our words by those of most labels
+    **dict.fromkeys(("rear", "rear_supported", "rear_unsupported"), "rearing"),
+    **dict.fromkeys(("walk", "run"), "walking"),
+    "pause": "standing",
+    "groom": "grooming",
+}
+_NO_WORD = ("", "na", "none", "nan")
+_DRAWS = 2000
+
+
+def evaluate_tracks(
+    folder: str | Path, *, names: str | Path | None = None, progress: Progress = silent
+) -> dict[str, Any]:
+    """Score rules and recognisers against people's words in 3D points of real mice.
+
+    Args:
+        folder: files of points, see `liex_lab.exchange.points.read_points`, each with `label` (n,)
+            in it, or with NAME.labels.csv or NAME.boris beside it.
+        names: a table of names (TOML); its `words` and `animals` are read as well. An animal is
+            the part of a file's name after its last _.
+        progress: called with the stage.
+
+    Returns:
+        `rearing_f1_...` and `macro_f1_...` of rules, bundled, taught and taught_without_z;
+        `interval95` of each; `per_animal` with both; the numbers of recordings and animals; and
+        the protocol.
+
+    Raises:
+        LiexError: a file cannot be used, has no labels or none of the stated words, or there is one
+            animal only.
+    """
+    table = PointNames.load(names)
+    ours = table.words or _WORDS
+    files = [path for path in sorted(Path(folder).glob("*")) if path.suffix in READERS]
+    pairs = [_people(path, table) for path in files if not path.name.endswith(".labels.csv")]
+    people = [one for one, _ in pairs]
+    animals = sorted({one.animal for one in people})
+    words = [word for word in dict.fromkeys(ours.values()) if any(word in p.words for p in people)]
+    if len(animals) < 2 or ours.get("rear") not in words:
+        raise LiexError(
+            f"files of at least two animals with the word {ours.get('rear')} are needed, and "
+            f"{folder} has {len(people)} of {len(animals)} with {', '.join(words) or 'no word'}; "
+            "state animals and words in the table of names (--names)"
+        )
+    bundled = storage.load_action_model("mouse")
+    found = {
+        "rules": [_named(one, ours) for one in people],
+        "bundled": [_named(one, ours, bundled) for one in people],
+        "taught": _taught(people, words, progress),
+        "taught_without_z": _taught([flat for _, flat in pairs], words, progress),
+    }
+    counts = {
+        name: [_counted(one, other, words) for one, other in zip(people, named, strict=True)]
+        for name, named in found.items()
+    }
+    of_animal = {
+        animal: [k for k, one in enumerate(people) if one.animal == animal] for animal in animals
+    }
+    score = partial(_scored, rearing=words.index(ours["rear"]))
+    n_all = {"n_recordings": len(people), "n_animals": len(animals)}
+    return {
+        **score({name: np.stack([c.sum(axis=0) for c in of]) for name, of in counts.items()}),
+        "per_animal": {
+            animal: score(
+                {name: np.concatenate([of[k] for k in rows]) for name, of in counts.items()}
+            )
+            for animal, rows in of_animal.items()
+        },
+        "words": words,
+        **n_all,
+        "protocol": TRACKS_PROTOCOL.format(**n_all, n_draws=_DRAWS),
+    }
+
+
+def _people(path: Path, table: PointNames) -> tuple[LabelledTrack, LabelledTrack]:
+    """The track of a file with people's words, and the same one without heights."""
+    skeleton, plan = Skeleton.load("mouse"), Plan.load("mouse")
+    points = read_points(path, table)
+    mapped = table.of_joints(skeleton.names, points.names)
+    words = points.words
+    if words is None:
+        beside = [path.with_suffix(end) for end in (".labels.csv", ".boris")]
+        labels = next((one for one in beside if one.is_file()), beside[0])
+        words = words_of(read_any_labels(labels), points.time_s)
+    if len(words) != len(points.time_s):
+        raise LiexError(
+            f"{path} has {len(points.time_s)} frames and {len(words)} labels; each frame needs one"
+        )
+    level = replace(points, points_mm=points.points_mm * [1.0, 1.0, 0.0])
+    track, other = (
+        track_of_points(some, skeleton, mapped, plan.tracking.bridge_s) for some in (points, level)
+    )
+    check_track(track, plan)
+    one = LabelledTrack(
+        track,
+        np.where(np.isin(words, _NO_WORD), ethogram.UNLABELLED, words),
+        table.animals.get(path.stem, path.stem.rpartition("_")[2]),
+        np.full(track.n_frames, np.nan),
+    )
+    return one, replace(one, track=other)
+
+
+def _named(
+    one: LabelledTrack, ours: Mapping[str, str], model: TimelineModel | None = None
+) -> NDArray[np.str_]:
+    """The words (n,) of a track by a recogniser, or by the rules, in the person's terms."""
+    rows = Rows(one.track, np.arange(len(one)), "", "")
+    named = (
+        words_of(measure_rows(rows).bouts, rows.time_s)
+        if model is None
+        else recognise(model, one.track).ethogram.words(one.track.times_ns)
+    )
+    return np.array([ours.get(str(word), "") for word in named])
+
+
+def _taught(
+    people: Sequence[LabelledTrack], words: Sequence[str], progress: Progress
+) -> list[NDArray[np.str_]]:
+    """The likeliest word (n,) of each frame by a recogniser taught by the other animals."""
+    found = {}
+    for animal in sorted({one.animal for one in people}):
+        progress(0, None, f"learning without {animal}")
+        model = learning.learn([one for one in people if one.animal != animal])
+        known = [k for k, word in enumerate(model.words) if word in words]
+        for k, one in enumerate(people):
+            if one.animal == animal:
+                p = np.nan_to_num(model.recognise(one.track).probability[:, known])
+                found[k] = np.array(model.words)[known][p.argmax(axis=1)]
+    return [found[k] for k in range(len(people))]
+
+
+def _counted(one: LabelledTrack, found: NDArray[np.str_], words: Sequence[str]) -> Array:
+    """Frames (minutes, K, 3) hit, found and true of each word, of those with a person's word."""
+    minute = (one.track.times_ns // 60_000_000_000).astype(int)
+    labelled = one.words != ethogram.UNLABELLED
+    return np.array(
+        [
+            [np.bincount(minute, mask) for mask in (hit & true, hit & labelled, true)]
+            for hit, true in ((found == word, one.words == word) for word in words)
+        ],
+        float,
+    ).transpose(2, 0, 1)
+
+
+def _scored(counts: Mapping[str, Array], rearing: int) -> dict[str, Any]:
+    """Scores and their intervals from counts (units, K, 3) of each method."""
+    scores: dict[str, Any] = {}
+    intervals: dict[str, list[float]] = {}
+    for name, of in counts.items():
+        drawn = np.random.default_rng(0).integers(0, len(of), (_DRAWS, len(of)))
+        sums = np.concatenate([of.sum(axis=0, keepdims=True), of[drawn].sum(axis=1)])
+        with np.errstate(invalid="ignore"):
+            f1 = np.where(sums[..., 2] > 0, 2.0 * sums[..., 0] / sums[..., 1:].sum(-1), np.nan)
+        for kind, values in (("rearing_f1", f1[:, rearing]), ("macro_f1", np.nanmean(f1, axis=1))):
+            scores[f"{kind}_{name}"] = float(values[0])
+            intervals[f"{kind}_{name}"] = np.nanquantile(values[1:], (0.025, 0.975)).tolist()
+    return {**scores, "interval95": intervals}
 
 
 def _share(true: Sequence[str], found: Sequence[str]) -> float:

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Array, Skeleton
-from liex_lab.errors import LiexError
-from liex_lab.runtime.memory import check_npz
+from liex_lab.errors import LiexError, refuse
+from liex_lab.exchange.points import PointNames, read_points
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation.recording import FRAME_NS, SyntheticSession
 from liex_lab.simulation.simulator import world_of
@@ -192,9 +192,6 @@ def nearest(real: PointMotion, virtual: PointMotion) -> Array:
     )
 
 
-UPS = {
-    sign + axis: (k, -1.0 if sign else 1.0) for k, axis in enumerate("xyz") for sign in ("", "-")
-}
 _SEEDS = range(300, 312)  # of recordings of a virtual mouse
 _PER_RECORDING = 300
 _N_POSTURES = 12_000
@@ -218,7 +215,7 @@ def evaluate_motion(
         reference: .npz with `points_mm` (n, P, 3), `names` (P,), and, if there are breaks,
             `clip_frames`, the number of frames between breaks.
         names: those of the five points, from the tail's base to the nose.
-        up: the axis of the file that points up, a key of `UPS`.
+        up: the axis of the file that points up: x, y, z, -x, -y or -z.
         rate_hz: frame rate of the file; None leaves the speeds out.
         progress: called recording by recording.
 
@@ -263,63 +260,41 @@ def read_motion(path: Path, names: Sequence[str], up: str, rate_hz: float | None
     Args:
         path: of the .npz, see `evaluate_motion`.
         names: of the five points, from the tail's base to the nose.
-        up: a key of `UPS`.
+        up: the axis of the file that points up.
         rate_hz: frames per second; None if unknown.
 
     Raises:
         LiexError: the file cannot be read, lacks a point, or is upside down.
     """
-    if up not in UPS:
-        raise LiexError(f"up is one of {', '.join(UPS)}, got '{up}'")
     if len(names) != len(POINTS):
         raise LiexError(f"five points are needed ({', '.join(POINTS)}), got {len(names)} names")
-    try:
-        check_npz(path, 2_000_000_000)
-        with np.load(path) as held:
-            points = held["points_mm"].astype(float)
-            known = [str(name) for name in held["names"]]
-            clip = int(held["clip_frames"]) if "clip_frames" in held else len(points)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise LiexError(
-            f"{path} holds no motion: an .npz with points_mm (n, P, 3) and names (P,) is "
-            f"expected ({error})"
-        ) from None
-    if points.ndim != 3 or points.shape[1:] != (len(known), 3) or clip < 1:
-        raise LiexError(
-            f"{path}: points_mm (n, {len(known)}, 3) is expected for {len(known)} names and "
-            f"clip_frames of 1 or more, got {points.shape} and {clip}"
-        )
-    missing = [name for name in names if name not in known]
-    if missing:
-        raise LiexError(f"{path} has no point {', '.join(missing)}; it has {', '.join(known)}")
-    chosen = _upright(points, [known.index(name) for name in names], up, path)
-    clips = np.arange(len(points)) // clip
+    table = PointNames.load(
+        None, up=up, fps=rate_hz or 1.0, joints=dict(zip(POINTS, names, strict=True))
+    )
+    points = read_points(path, table)
+    columns = [points.names.index(one) for (one,) in table.of_joints(POINTS, points.names).values()]
+    with np.load(path) as held:
+        clip = int(held.get("clip_frames", len(points.points_mm)))
+    chosen = points.points_mm[:, columns]
+    below = np.delete(points.points_mm, columns, axis=1)[..., 2]
+    off = np.nanmedian(below) - np.nanmedian(chosen[:, 1:4, 2]) if below.size else 0.0
     whole = np.isfinite(chosen).all(axis=(1, 2))
-    if whole.sum() < _FEWEST:
-        raise LiexError(
-            f"{path}: {whole.sum()} frames have all five points, and {_FEWEST} are needed"
-        )
+    refuse(
+        LiexError,
+        (clip < 1, f"{path}: clip_frames of 1 or more are expected, got {clip}"),
+        (
+            off > 0,
+            f"{path}: with '{up}' up the back lies {off:.0f} mm below the other points; state "
+            "which axis points up (--up)",
+        ),
+        (
+            whole.sum() < _FEWEST,
+            f"{path}: {whole.sum()} frames have all five points, and {_FEWEST} are needed",
+        ),
+    )
     # incomplete frames are breaks
-    clips = clips * len(points) + np.cumsum(~whole)
+    clips = (np.arange(len(chosen)) // clip) * len(chosen) + np.cumsum(~whole)
     return PointMotion(chosen[whole], clips[whole], rate_hz)
-
-
-def _upright(points: Array, columns: list[int], up: str, path: Path) -> Array:
-    """The chosen points (n, 5, 3) with z up.
-
-    Raises LiexError if their back is below the other points.
-    """
-    axis, sign = UPS[up]
-    level = [k for k in range(3) if k != axis]
-    turned = np.stack([points[..., level[0]], points[..., level[1]], sign * points[..., axis]], -1)
-    back = np.nanmedian(turned[:, columns[1:4], 2])
-    others = [k for k in range(points.shape[1]) if k not in columns]
-    if others and back < np.nanmedian(turned[:, others, 2]):
-        raise LiexError(
-            f"{path}: with '{up}' up the back lies {np.nanmedian(turned[:, others, 2]) - back:.0f} "
-            "mm below the other points; state which axis points up (--up)"
-        )
-    return turned[:, columns]
 
 
 def _shares(points_mm: Array) -> Array:

@@ -28,9 +28,9 @@ def test_a_rear_is_found_once_with_its_rise_and_its_fall():
     assert list(bouts["action"]) == ["walk", "rear", "walk"]
     rear = bouts.iloc[1]
     assert rear["start_s"] == pytest.approx(
-        1.06, abs=0.04
-    )  # two thirds of 40 mm are reached 0.05 s into the rise
-    assert rear["stop_s"] == pytest.approx(2.15, abs=0.04)
+        1.04, abs=0.04
+    )  # half of 0.4 lengths is reached 0.03 s into the rise
+    assert rear["stop_s"] == pytest.approx(2.18, abs=0.04)
     assert rear["duration_s"] == pytest.approx(rear["stop_s"] - rear["start_s"])
     assert rear["peak_nose_height_mm"] > 80
     assert rear["path_mm"] == pytest.approx(200 * rear["duration_s"], rel=1e-2)
@@ -58,8 +58,8 @@ def test_a_bout_ends_at_a_gap_one_step_after_its_last_frame():
 
 def test_a_small_animal_rears_at_a_share_of_its_length_and_a_large_one_at_40_mm():
     rules = MouseRules()
-    assert rules.rear_mm(90.0) == 40.0
-    assert rules.rear_mm(52.0) == pytest.approx(31.2)
+    assert rules.rear_mm(110.0) == 40.0
+    assert rules.rear_mm(52.0) == pytest.approx(20.8)
     assert "40 mm" in rules.definitions()["rear"]
 
 
@@ -180,3 +180,12 @@ def test_words_of_ones_own_are_not_checked() -> None:
     one = going_and_staying(12)
     assert recognise(own, one.track).refused == ()
     assert recognise(own, one.track).ethogram == own.recognise(one.track).ethogram
+
+
+def test_a_rear_is_raised_above_the_usual_tail_base_and_not_that_of_one_frame() -> None:
+    mouse = WalkingMouse(steady(4.0))
+    frames, poses = tables_of(mouse)
+    poses = poses.copy()
+    sunk = (poses["joint"] == "rump") & poses["time_s"].between(1.0, 2.0)
+    poses.loc[sunk, "z_mm"] -= 60.0
+    assert "rear" not in set(find_bouts(frames, kinematics(frames, poses))["action"])

@@ -129,7 +129,7 @@ def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
     file = own_mouse(tmp_path / "mouse.npz")
     for words, expected in (
         (["--up", "-z"], "mm below the other points"),
-        (["--up", "w"], "up is one of"),
+        (["--up", "w"], "up should be"),
         (["--points", "TTI,Nose"], "five points are needed"),
         (["--points", "TTI,Trunk,Spine,Neck,Snout"], "has no point Snout"),
     ):
