@@ -322,7 +322,21 @@ def evaluate_tables(
         echo(path)
 
 
-@benchmark("actions")
+def show_actions(result: Result) -> None:
+    """Print the numbers; of people's words, a row for all animals and for each of them."""
+    if "per_animal" in result:
+        rows = {"all animals": result, **result["per_animal"]}
+        print_rows(
+            {
+                name: {k: v for k, v in of.items() if isinstance(v, float)}
+                for name, of in rows.items()
+            }
+        )
+    else:
+        print_numbers(result)
+
+
+@benchmark("actions", show_actions)
 def evaluate_actions(
     animal: AnimalName = "fish",
     model: Annotated[
