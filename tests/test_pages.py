@@ -73,6 +73,7 @@ AFTER = {
     "docs/howto/movement.md": "README.md",
     "docs/howto/nwb.md": "README.md",
     "docs/howto/points.md": "README.md",
+    "docs/howto/skin-points.md": "README.md",
     "docs/howto/spreadsheet.md": "README.md",
     "docs/reference/session-folder.md": "README.md",
     "docs/tutorials/study.md": "docs/tutorials/mouse.md",

@@ -161,7 +161,7 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="nwb, boris, dlc (or deeplabcut), movement, sleap, csv, xlsx or video.",
+            help="nwb, boris, dlc (or deeplabcut), movement, sleap, points, csv, xlsx or video.",
         ),
     ],
     out: Annotated[
@@ -170,6 +170,12 @@ def export(
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an existing file or folder.")
+    ] = False,
+    points: Annotated[
+        bool,
+        typer.Option(
+            "--points", help="dlc, movement, sleap: write points on the skin instead of joints."
+        ),
     ] = False,
     actions: Annotated[
         list[str] | None,
@@ -191,10 +197,12 @@ def export(
         float, typer.Option("--slower", metavar="N", help="Video: slow-motion factor.")
     ] = 1.0,
 ) -> None:
-    """Export sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, CSV or Excel, or as a video."""
+    """Export sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, points, CSV, Excel or a video."""
     from liex_lab.exchange import export as job
 
     if to == "video":
+        if points:
+            raise typer.BadParameter("--points is for dlc, movement and sleap, a video has none")
         with progress_bar() as progress:
             video = api.export_video(
                 places,
@@ -214,7 +222,8 @@ def export(
             "actions, groups and times are chosen for `--to video`; the other formats hold all"
         )
     for place in places:
-        echo(f"export: {job(liex_lab.Session.open(place), to, out, overwrite=overwrite)}")
+        path = job(liex_lab.Session.open(place), to, out, overwrite=overwrite, points=points)
+        echo(f"export: {path}")
 
 
 # The command `liex show`: a session's replay in Rerun, optionally with full depth images.

@@ -24,6 +24,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from liex_lab.errors import SessionError, did_you_mean, how_to_install
+from liex_lab.exchange.skin_points import derived_points
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
@@ -57,6 +58,11 @@ TARGETS: dict[str, tuple[str, str, str]] = {
         ".analysis.h5",
         "SLEAP's analysis file, in pixels of the depth image",
     ),
+    "points": (
+        "skin_points.write_points",
+        "_points",
+        "a folder with points on the skin, derived from the fitted body: points.parquet, mabe.csv",
+    ),
     "csv": (
         "export.write_csv_folder",
         "_csv",
@@ -69,10 +75,16 @@ TARGETS: dict[str, tuple[str, str, str]] = {
     ),
 }
 ALIASES = {"deeplabcut": "dlc"}
+WITH_POINTS = ("dlc", "movement", "sleap")  # formats of joints, or of points in their place
 
 
 def export(
-    session: Session, to: str, out: str | Path | None = None, *, overwrite: bool = False
+    session: Session,
+    to: str,
+    out: str | Path | None = None,
+    *,
+    overwrite: bool = False,
+    points: bool = False,
 ) -> Path:
     """Write a session in another program's format; returns the file or folder.
 
@@ -83,9 +95,12 @@ def export(
         to: the format, a word of `TARGETS` or `ALIASES`.
         out: the output folder, created if missing; None uses the session's own.
         overwrite: replace an existing file.
+        points: write points on the skin (module `skin_points`) in place of the joints, under a
+            name with `_points`; for dlc, movement and sleap.
 
     Raises:
-        SessionError: the format is unknown, the file exists, or packages are missing.
+        SessionError: the format is unknown or has no points, the file exists, or packages are
+            missing.
     """
     to = ALIASES.get(to, to)
     if to not in TARGETS:
@@ -100,7 +115,12 @@ def export(
             f"{', '.join(ALIASES)} (the same as dlc) and video"
         )
     home, function = TARGETS[to][0].split(".")
-    ending = TARGETS[to][1]
+    if points and to not in WITH_POINTS:
+        raise SessionError(
+            f"points in place of joints are written to {', '.join(WITH_POINTS)}, not to {to}; use "
+            "one of these, or the format points for a table of them"
+        )
+    ending = "_points" * points + TARGETS[to][1]
     folder = session.path if out is None else Path(out)
     if folder.exists() and not folder.is_dir():
         raise SessionError(
@@ -116,8 +136,9 @@ def export(
         )
     try:
         write = getattr(import_module(f"liex_lab.exchange.{home}"), function)
+        own = (derived_points(session),) if points else ()
         with durable.replacing(path, replace_folder=True) as part:
-            write(session, part)
+            write(session, part, *own)
     except ImportError as error:
         raise SessionError(
             f"to write {to}, {error.name} is missing; {how_to_install('exchange')}"
@@ -249,9 +270,9 @@ def hdf5_file(path: Path) -> Iterator[h5py.File]:
 SCORER = "liex_lab"
 
 
-def write_dlc(session: Session, path: Path) -> None:
+def write_dlc(session: Session, path: Path, points: PoseArrays | None = None) -> None:
     """Write a new folder with both tables, the times and the bouts."""
-    poses = session.pose_arrays()
+    poses = points or session.pose_arrays()
     path.mkdir()
     write_csv(dlc_table(poses, poses.xyz_mm, "xyz"), path / "poses_3d.csv", index=True)
     flat = np.concatenate([poses.uv_px, poses.likelihood[..., None]], axis=-1)
@@ -284,14 +305,14 @@ def dlc_table(poses: PoseArrays, values: Array, coords: str | tuple[str, ...]) -
 # SLEAP's analysis file (HDF5), in its own order of axes (Matlab's).
 
 
-def write_sleap(session: Session, path: Path) -> None:
+def write_sleap(session: Session, path: Path, points: PoseArrays | None = None) -> None:
     """Write one track with every recorded frame as an .analysis.h5 file.
 
     Pixel coordinates are SLEAP's, from the centre of the top-left pixel.
     """
     import h5py
 
-    poses = session.pose_arrays()
+    poses = points or session.pose_arrays()
     observed = np.isfinite(poses.uv_px[:, :, 0])
     order = {
         "tracks": ("track", "xy", "node", "frame"),
@@ -335,7 +356,7 @@ def write_sleap(session: Session, path: Path) -> None:
 # Poses data set of the Python package movement as netCDF; xarray and `movement.io` open it.
 
 
-def write_movement(session: Session, path: Path) -> None:
+def write_movement(session: Session, path: Path, points: PoseArrays | None = None) -> None:
     """Write netCDF 4 (.nc)."""
     # in memory, see `hdf5_file`
-    path.write_bytes(session.to_xarray().to_netcdf(engine="h5netcdf"))
+    path.write_bytes(session.to_xarray(points).to_netcdf(engine="h5netcdf"))

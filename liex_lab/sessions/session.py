@@ -341,12 +341,15 @@ class Session:
             facts = self.described if name == "sessions" else {}
             return found.assign(**{key: facts[key] for key in facts if key in found})
 
-    def to_xarray(self) -> xarray.Dataset:
+    def to_xarray(self, points: PoseArrays | None = None) -> xarray.Dataset:
         """The poses as a labelled data set, in the format of the Python package movement.
 
         The dimensions are time (s since the first frame), space (x, y, z; mm, arena frame),
         keypoints and individuals; the variables position, confidence, score, sd_mm and action;
         pulse_index is a coordinate along time. See `PoseArrays.likelihood` on the confidence.
+
+        Args:
+            points: keypoints in place of the joints, as from `liex_lab.exchange.skin_points`.
 
         Raises:
             MissingPackageError: xarray is not installed.
@@ -358,7 +361,7 @@ class Session:
                 f"a labelled data set needs xarray; {how_to_install('exchange')}"
             ) from None
 
-        poses = self.pose_arrays()
+        poses = points or self.pose_arrays()
         bouts = self.bouts
         actions = np.full(len(poses.frame_index), "", dtype=object)
         starts, stops = (
@@ -393,6 +396,7 @@ class Session:
                 "space_unit": "mm",
                 "axes": "arena: z up from the floor",
                 **({"fps": float(rate)} if rate else {}),
+                **({"keypoints": "derived, on the skin"} if points else {}),
             },
         )
 

@@ -47,7 +47,7 @@ NOT_FROM_CAMERA = (
     HIDDEN,
     "tracker_lost",
 )  # reasons of gaps not caused by the camera
-_NEAR = 0.1  # radius of a joint's score, as a share of the spine
+NEAR = 0.1  # radius of a joint's score, as a share of the spine
 
 
 @dataclass(frozen=True)
@@ -157,7 +157,7 @@ class Rows:
             **{f"{axis}_mm": track.joints_mm[:, :, k].ravel() for k, axis in enumerate("xyz")},
             **{f"{axis}_px": track.uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
             "score": nearness(
-                np.sqrt((track.sd_xyz_mm**2).mean(axis=-1)), _NEAR * track.spine_mm[:, None]
+                np.sqrt((track.sd_xyz_mm**2).mean(axis=-1)), NEAR * track.spine_mm[:, None]
             ).ravel(),
             "sd_mm": track.sd_mm.ravel(),
             "sd_xy_mm": track.sd_xy_mm.ravel(),

@@ -139,6 +139,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
     for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "sessions")
 }
 FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS = TABLES.values()
+POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
 
@@ -149,7 +150,7 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    every = chain(*TABLES.values(), branching, swimming, walking)
+    every = chain(*TABLES.values(), POINTS, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 
 

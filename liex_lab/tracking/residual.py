@@ -72,6 +72,12 @@ class BodyResidual:
     camera_view: bool = False
     size: float | None = None
 
+    def across(self, scale: Array) -> Array:
+        """Factors (n,) of all lengths across the body with bones of these scales (n,)."""
+        if self.size is None or not isinstance(self.surface.body, BodyShape):
+            return self.girth * scale
+        return self.girth * np.asarray(self.size * np.sqrt(self.size / scale))
+
     def of(self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter) -> Array:
         """Median absolute difference between body and reading over the pixels that both cover.
 
@@ -99,10 +105,8 @@ class BodyResidual:
         out = np.empty((4, len(pose_arena.scale)))
         if not out.size:
             return BodyAgreement(*out)
-        across = pose_arena.scale
-        if self.size is not None and isinstance(self.surface.body, BodyShape):
-            across = self.size * np.sqrt(self.size / across)
-        rendered = render_crops(self.surface, pose_arena, self.girth * across, crops, scene)
+        across = self.across(pose_arena.scale)
+        rendered = render_crops(self.surface, pose_arena, across, crops, scene)
         planes = scene.planes(crops, self.camera_view)
         joints = scene.camera.project(
             scene.floor.T_arena_camera.inverse() @ joints_of(self.surface.skeleton, pose_arena)

@@ -44,3 +44,14 @@ def test_sleap_io_reads_the_analysis_file(session, tmp_path):
     assert [node.name for node in labels.skeletons[0].nodes] == list(poses.joints)
     assert len(labels.skeletons[0].edges) == len(poses.bones)
     np.testing.assert_allclose(labels.numpy()[:, 0], poses.uv_px, rtol=1e-6)
+
+
+def test_movement_and_sleap_io_read_derived_points(session, tmp_path):
+    path = export(session, "movement", tmp_path, points=True)
+    data = xarray.load_dataset(path, engine="h5netcdf")
+    ValidPosesInputs.validate(data)
+    folder = export(session, "dlc", tmp_path, points=True)
+    dlc = load_poses.from_dlc_file(folder / "poses_2d.csv")
+    assert list(dlc["keypoints"].values) == list(data["keypoints"].values)
+    labels = sleap_io.load_file(str(export(session, "sleap", tmp_path, points=True)))
+    assert [node.name for node in labels.skeletons[0].nodes] == list(data["keypoints"].values)
