@@ -538,6 +538,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     jumps = [gap.start_frame for gap in recording.gaps if gap.reason == timestamps.JUMPED]
     centre, at_edge = unusual_centre(recording.camera)
     place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
+    shape = "" if tracker.shape is None else tracker.shape.caution(tracker.spine_mm)
     verdict = Verdict.of(
         tracked.track,
         whole,
@@ -556,7 +557,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *copied,
             *tracker.scene.remarks,
             *recording.files.grown(),
-            *filter(None, [lens, "" if at_edge else centre]),
+            *filter(None, [lens, "" if at_edge else centre, shape]),
             *place,
             *(f"{timestamps.PULSES_UNKNOWN}, first before frame {k}" for k in jumps[:1]),
         ),

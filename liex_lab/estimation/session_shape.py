@@ -10,6 +10,11 @@ cross-sections) determine the build, and with it that error. A linear map fitted
 
 maps the clues to the mean of true minus estimated joints in the base's frame, over the length, and
 to the logarithms of half width and half height over the average animal's at five positions.
+
+A linear map extrapolates: on a body unlike those of the training, such as one with a sharper back,
+it can be wrong by a multiple. If a clue lies far outside the training, the map is not used. Such a
+body is as wide as its outline, and as high as an average animal of that width, with the standard
+deviations that this leaves: the height of a body that swims is not visible from above.
 """
 
 from __future__ import annotations
@@ -99,6 +104,13 @@ PLACES = (0.1, 0.25, 0.4, 0.6, 0.8)  # of the body's length
 _RIDGE = 0.03  # of the clues' variance
 _FOLDS = 5
 _TAIL = 0.005  # quantile of a clue in training at which it is clipped
+# of a clue's range in training: bodies of its families stay within half of this
+_FAR = 0.25
+# standard deviations for a body unlike those of the training: of the logarithm of its height, and
+# of the joints' height over the length
+_UNLIKE_SD = 0.35
+_UNLIKE_UNSEEN = 0.04
+_BACKS = 8  # groups of stations in which the height of the back is a clue
 
 
 def session_clues(
@@ -133,7 +145,7 @@ def session_clues(
     return np.concatenate(
         [
             width,
-            _grouped(back[:, :1], width, 8),
+            _grouped(back[:, :1], width, _BACKS),
             _grouped(back[:, :1] - back[:, 1:], width, 6),
             [torn.mean()],
             [float(np.median(mm_per_px(crop_cameras))) / (skeleton.length * size)],
@@ -215,6 +227,16 @@ class ShapePrior:
         table = np.vstack(ridge_regression(x, labels, _RIDGE, 1e-9))
         return ShapePrior(bounds, table, left.std(axis=0))
 
+    def is_unlike(self, clues: Array) -> bool:
+        """Whether clues (F,) lie so far outside the training that `predict` extrapolates."""
+        low, high = self.bounds
+        beyond = np.maximum(low - clues, clues - high)
+        return bool((beyond > _FAR * (high - low)).any())
+
+    def unseen_of(self, unlike: bool) -> tuple[float, float]:
+        """`unseen`, or larger for a body unlike those of the training."""
+        return (_UNLIKE_UNSEEN, self.unseen[1]) if unlike else self.unseen
+
     def predict(self, clues: Array) -> Array:
         """The labels of sessions.
 
@@ -228,6 +250,39 @@ class ShapePrior:
         return np.asarray(
             (np.clip(clues, *self.bounds) @ self.table[:-1] + self.table[-1]).round(9)
         )
+
+
+def outline_labels(skeleton: Skeleton, clues: Array) -> Array:
+    """Labels of a body unlike those of the training, from its outline alone.
+
+    Its width is that of the outline and its height that of an average animal of the same width. Its
+    joints are moved up or down until the back of that body lies where the back is visible.
+
+    Args:
+        skeleton: of the animal, one chain with a tube as its surface.
+        clues: (F,), see `session_clues`.
+
+    Returns:
+        (K,), see `labels_of`.
+    """
+    average = BodyShape.default(skeleton)
+    at = np.linspace(_FROM, _TO, N_STATIONS)
+    groups = np.array_split(np.arange(_MARGIN, N_STATIONS - _MARGIN), _BACKS)
+    trunk = slice(1, _BACKS // 2 + 1)  # the groups that are widest
+    middles = np.array([at[group].mean() for group in groups])[trunk]
+
+    def usual(values: Array, places: Array) -> Array:
+        return np.interp(places, skeleton.surface["stations"], values) / skeleton.length
+
+    places = np.array(PLACES)
+    width = np.interp(places, at, clues[:N_STATIONS]) / usual(average.half_width, places)
+    broad = float(
+        np.median(np.interp(middles, at, clues[:N_STATIONS]) / usual(average.half_width, middles))
+    )
+    back = clues[N_STATIONS : N_STATIONS + _BACKS][trunk]
+    offset = np.zeros((skeleton.n_joints, 3))
+    offset[:, 2] = np.median(back - broad * usual(average.half_height, middles))
+    return labels_of(offset, np.clip(width, 0.5, 2.0), np.full(len(places), broad)).round(9)
 
 
 def labels_of(offset: Array, width: Array, height: Array) -> Array:
@@ -263,12 +318,13 @@ class Build:
     unseen: tuple[float, float]
 
     @staticmethod
-    def of(prior: ShapePrior, labels: Array) -> Build:
+    def of(prior: ShapePrior, labels: Array, unlike: bool = False) -> Build:
         """The build stated by labels, with the uncertainty of one estimated from clues.
 
         Args:
             prior: of the animal.
             labels: (K,), see `labels_of`.
+            unlike: whether the body is unlike those of the training.
         """
         p = len(PLACES)
         return Build(
@@ -276,8 +332,8 @@ class Build:
             np.exp(labels[-2 * p : -p]),
             np.exp(labels[-p:]),
             prior.spread[-2 * p : -p],
-            prior.spread[-p:],
-            prior.unseen,
+            np.full(p, _UNLIKE_SD) if unlike else prior.spread[-p:],
+            prior.unseen_of(unlike),
         )
 
     def corrected(self, skeleton: Skeleton, pose: Pose, size: float) -> Pose:

@@ -293,6 +293,7 @@ class _Shape(_Section):
     residual_mm: Finite | None = None
     why: str = ""
     shared_by: str = ""
+    unlike: bool = False
     places: list[Finite] = []
     width: list[Factor] = []
     width_sd: list[Finite] = []

@@ -26,6 +26,7 @@ from liex_lab.estimation.session_shape import (
     Build,
     ShapePrior,
     built,
+    outline_labels,
     session_clues,
 )
 from liex_lab.scene.height_maps import Segmenter, view_of
@@ -62,6 +63,8 @@ class OwnShape:
         residual_mm: the same of the fitted body in the corrected poses.
         why: why the average body was kept; empty if it was not.
         shared_by: source of a stated shape; empty if it was estimated from the session's frames.
+        unlike: whether the body is unlike those that shapes were learned from.
+        unseen: see `Build.unseen`; None if the animal's usual values apply.
     """
 
     build: Build | None
@@ -70,6 +73,18 @@ class OwnShape:
     residual_mm: float = float("nan")
     why: str = ""
     shared_by: str = ""
+    unlike: bool = False
+    unseen: tuple[float, float] | None = None
+
+    def caution(self, length_mm: float) -> str:
+        """A sentence for the user if the body is unlike those of the training, else empty."""
+        if not self.unlike or self.unseen is None:
+            return ""
+        off_mm = self.unseen[0] * length_mm
+        return (
+            "the body is unlike those that shapes were learned from: its height is assumed, not "
+            f"measured, and the depth of all joints may be off by {off_mm:.1f} mm"
+        )
 
     def corrected(self, estimator: PoseEstimator, pose: Pose, size: float) -> Pose:
         """Poses minus the mean error of such a body; unchanged if it is unknown.
@@ -94,6 +109,7 @@ class OwnShape:
             "average_residual_mm": average,
             "residual_mm": own,
             **({"shared_by": self.shared_by} if self.shared_by else {}),
+            **({"unlike": True} if self.unlike else {}),
         }
         if build is None:
             return {**table, "why": self.why}
@@ -158,16 +174,17 @@ def fit_shape(
         pose = pose if build is None else build.corrected(skeleton, pose, size)
         return pose.moved(scene.floor.T_arena_camera)
 
-    if stated is None or stated.labels is None:
-        held_out = good[::3]  # every third frame is held out from the fit
-        fitted = np.setdiff1d(good, held_out)
-        cameras = scene.crop_cameras(estimates.crops, camera_view)[fitted]
-        pose = estimates.chosen.pose[fitted].moved(view_of(cameras))
-        heights = estimates.crops.heights[fitted]
-        labels = prior.predict(session_clues(skeleton, pose, heights, cameras, size))
+    # every third frame is held out from the fit
+    held_out, fitted = (good[::3], np.delete(good, np.s_[::3])) if stated is None else (good, good)
+    cameras = scene.crop_cameras(estimates.crops, camera_view)[fitted]
+    pose = estimates.chosen.pose[fitted].moved(view_of(cameras))
+    clues = session_clues(skeleton, pose, estimates.crops.heights[fitted], cameras, size)
+    unlike = prior.is_unlike(clues)
+    if stated is not None and stated.labels is not None:
+        labels = stated.labels
     else:
-        held_out, fitted, labels = good, good, stated.labels
-    build = Build.of(prior, labels)
+        labels = outline_labels(skeleton, clues) if unlike else prior.predict(clues)
+    build = Build.of(prior, labels, unlike)
     own = BodyResidual.fit(
         built(skeleton, build.width, build.height),
         poses(fitted, build),
@@ -185,8 +202,10 @@ def fit_shape(
             "on frames that were held out a body of its own leaves "
             f"{mm[1]:.2f} mm to the depth and the average one {mm[0]:.2f} mm"
         )
-        return OwnShape(None, len(good), *mm, why), average
-    return OwnShape(build, len(good), *mm, shared_by=by), own
+        return OwnShape(
+            None, len(good), *mm, why, "", unlike, prior.unseen_of(unlike) if unlike else None
+        ), average
+    return OwnShape(build, len(good), *mm, "", by, unlike, build.unseen), own
 
 
 def borne_out(before: Array, after: Array) -> bool:

@@ -19,6 +19,7 @@ from liex_lab.estimation.session_shape import (
     ShapePrior,
     built,
     cross_sections,
+    outline_labels,
     session_clues,
 )
 from liex_lab.scene.height_maps import view_of
@@ -92,6 +93,41 @@ def test_a_clue_beyond_all_that_was_seen_is_taken_for_the_last():
     prior = ShapePrior.fit(clues, clues @ [[1.0], [0.0]])
     far, edge = prior.predict(np.array([[50.0, 0.0], [1.0, 0.0]]))
     assert far == pytest.approx(edge, abs=0.02)
+
+
+def test_clues_far_outside_the_training_are_of_an_unlike_body():
+    prior = ShapePrior.fit(*(np.random.default_rng(7).uniform(-1, 1, (400, k)) for k in (2, 3)))
+    assert [prior.is_unlike(np.array([0.0, value])) for value in (0.9, -1.2, 1.3, -2.0)] == [
+        False,
+        False,
+        False,
+        True,
+    ]
+    assert prior.unseen_of(True)[0] > prior.unseen_of(False)[0]
+
+
+def test_an_unlike_body_is_as_high_as_usual_for_its_width_and_its_back_lies_where_it_is_visible(
+    toy,
+):
+    clues = session_clues_of(toy)
+    p = len(PLACES)
+
+    def read(labels: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        offset = labels[: -2 * p].reshape(-1, 3)
+        assert np.ptp(offset, axis=0).max() == 0.0
+        return offset[0, 2], np.exp(labels[-2 * p : -p]), np.exp(labels[-p:])
+
+    up, width, height = read(outline_labels(toy.skeleton, clues))
+    assert abs(up) < 0.03
+    np.testing.assert_allclose(width, 1.0, atol=0.2)
+    deeper = clues.copy()
+    deeper[N_STATIONS : N_STATIONS + 8] += 0.05  # the back is farther above the estimated joints
+    np.testing.assert_allclose(read(outline_labels(toy.skeleton, deeper))[0], up + 0.05)
+    broad = clues.copy()
+    broad[:N_STATIONS] *= 1.2
+    lower, wider, higher = read(outline_labels(toy.skeleton, broad))
+    np.testing.assert_allclose([wider / width, higher / height], 1.2)
+    assert lower < up
 
 
 def build(offset: np.ndarray) -> Build:

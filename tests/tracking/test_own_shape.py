@@ -101,6 +101,26 @@ def test_a_build_that_other_frames_contradict_is_not(toy, estimator, estimates, 
     assert shape.to_dict()["why"] == shape.why
 
 
+def test_the_height_of_an_unlike_body_is_assumed_and_the_user_is_cautioned(
+    toy, estimator, estimates
+):
+    prior = certain(toy, estimator, LIFTED, HIGHER)
+    unlike = replace(prior, bounds=prior.bounds + 50.0)
+    shape, _ = fitted(toy, estimator, estimates, unlike)
+    assert shape is not None
+    assert shape.unlike
+    assert shape.unseen is not None
+    assert shape.unseen[0] > prior.unseen[0]
+    assert "off by 4.0 mm" in shape.caution(100.0)
+    assert shape.to_dict()["unlike"]
+    if shape.build is not None:
+        assert (shape.build.height < 0.9 * HIGHER).all()
+        assert (shape.build.height_sd > 0.3).all()
+    usual, _ = fitted(toy, estimator, estimates, prior)
+    assert usual is not None
+    assert usual.caution(100.0) == ""
+
+
 def test_a_near_tie_of_medians_is_decided_frame_by_frame():
     before = np.array([1.0, 1.0, 1.0, 2.0, 3.0])
     assert borne_out(before, np.array([1.01, 1.01, 1.01, 1.0, 1.5])), "less in the mean"
