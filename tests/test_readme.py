@@ -84,7 +84,7 @@ def test_every_verb_option_setting_and_format_that_is_named_exists() -> None:
         if verb.startswith("--") or verb == "VERB":
             continue
         assert f"  {verb} " in top, call
-        inner = [words[1]] if verb in ("correct", "evaluate") and len(words) > 1 else []
+        inner = [words[1]] if verb in ("correct", "evaluate", "import") and len(words) > 1 else []
         if inner and not re.fullmatch(r"[a-z]+", inner[0]):
             inner = []
         options = helped(verb, *inner)
@@ -112,7 +112,7 @@ def test_every_column_that_is_named_is_one() -> None:
         if isinstance(table, dict)
         for key in table
     }
-    known |= {"expected_error_mm", "unit_mm", "mesh_unit_mm", "time_s"}
+    known |= {"expected_error_mm", "unit_mm", "mesh_unit_mm", "points_mm", "time_s"}
     assert len(named) > 20
     assert named <= known | OTHERS | SCENE, named - known
 
