@@ -24,7 +24,7 @@ from liex_lab.cli.options import (
     write_numbers,
 )
 from liex_lab.dashboards.paper.published import DEVIATIONS, HAND
-from liex_lab.errors import LiexError
+from liex_lab.errors import LiexError, refuse
 from liex_lab.runtime.progress import Progress, progress_bar
 
 
@@ -164,14 +164,18 @@ def benchmark(
 
 
 def show_poses(result: Result) -> None:
-    """Print the numbers of a split; for other-build, a row for each kind of build."""
-    if "usual" in result:
+    """Print the numbers of a split; a row for each kind of build, or for each foreign body."""
+    rows: Result = {kind: result[kind] for kind in ("other", "usual") if kind in result}
+    if "summary" in result:
+        rows = {**result["rows"], "median over bodies": result["summary"]}
+    if rows:
         print_rows(
             {
-                kind: {k: v for k, v in result[kind].items() if not isinstance(v, dict | list)}
-                for kind in ("other", "usual")
+                name: {k: v for k, v in row.items() if isinstance(v, int | float)}
+                for name, row in rows.items()
             }
         )
+        echo("\n".join(result.get("skipped", [])))
     else:
         print_numbers(result)
 
@@ -180,7 +184,10 @@ def show_poses(result: Result) -> None:
 def evaluate_pose(
     animal: AnimalName = "mouse",
     split: Annotated[
-        str, typer.Option("--split", help="clean, hard, other-body, other-camera or other-build.")
+        str,
+        typer.Option(
+            "--split", help="clean, hard, other-body, other-camera, other-build or foreign."
+        ),
     ] = "clean",
     variant: RowName = "default",
     model: OwnModel = None,
@@ -196,18 +203,37 @@ def evaluate_pose(
     ] = None,
     sealed: Annotated[
         bool,
-        typer.Option("--sealed", help="Use the held-out part of other-build; not for development."),
+        typer.Option(
+            "--sealed",
+            help="Use the held-out part of other-build or foreign; not for development.",
+        ),
     ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            "--truth",
+            metavar="PATH",
+            help="Folder of recordings with truth files NAME_truth.npz, or one such file, for the "
+            "split foreign; default: the project's own bodies.",
+        ),
+    ] = None,
     *,
     progress: Progress,
 ) -> Result:
-    """Measure joint errors on a fixed split of rendered frames (other-build: whole tracks)."""
-    if split == "other-build":
-        if variant != "default" or model or spine_mm:
-            raise LiexError("other-build is measured with the bundled model and sizes of its own")
-        return api.evaluate_builds(animal, n_frames=n_frames, sealed=sealed, progress=progress)
-    if sealed:
-        raise LiexError("--sealed belongs to the split other-build; leave it out")
+    """Measure joint errors on a split (other-build and foreign: whole tracks)."""
+    tracks = {"other-build": api.evaluate_builds, "foreign": api.evaluate_foreign}.get(split)
+    refuse(
+        LiexError,
+        (
+            tracks and (variant != "default" or model or spine_mm),
+            f"{split} is measured with the bundled model and sizes of its own",
+        ),
+        (truth and split != "foreign", "--truth belongs to the split foreign; leave it out"),
+        (sealed and not tracks, "--sealed belongs to other-build and foreign; leave it out"),
+    )
+    if tracks:
+        more = {"truth": truth} if split == "foreign" else {}
+        return tracks(animal, n_frames=n_frames, sealed=sealed, progress=progress, **more)
     return api.evaluate_pose(
         animal,
         split,

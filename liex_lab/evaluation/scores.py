@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -329,10 +329,16 @@ class MeasuredIndividual:
     Attributes:
         joints_camera: (n, J, 3) mm, camera frame; NaN without a pose.
         trusted: (n,) bool, whether the tables flag the pose as trusted.
+        sd_mm: (n, J, 3) standard deviations along x, y and z of the arena, mm.
+        expected_mm: (n,) predicted error, mm.
+        R_arena_camera: (3, 3) from the axes of `joints_camera` to the arena's.
     """
 
     joints_camera: Array
     trusted: Mask
+    sd_mm: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    expected_mm: Array = field(default_factory=lambda: np.zeros(0))
+    R_arena_camera: Array = field(default_factory=lambda: np.eye(3))
 
 
 class Tally:

@@ -24,6 +24,7 @@ from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
 from liex_lab.simulation import corruptions, training_patches
 from liex_lab.simulation.corruptions import Event, Loss
+from liex_lab.simulation.foreign import KINDS, SEALED_BODY, ForeignRecording
 from liex_lab.simulation.hand.simulator import (
     NYU_SENSOR,
     HandFrameContents,
@@ -337,7 +338,7 @@ def _with_objects(
 
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
 _SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
-_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, "scene")
+_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, "scene", "foreign")
 _SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
 _BUILDS = ("other", "train")  # builds of animals in scenes: not used in training, or used
@@ -353,7 +354,8 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     of a mouse, or with animal=fish or animal=hand of those; with a
     seed or more frames they are new sequences of the same kind. scene is one of
     `simulation.scenes`, such as synthetic:scene?name=raised&seed=3; build=train uses a training
-    body.
+    body. foreign is a body that does not come from the training's generator, such as
+    synthetic:foreign?animal=fish&body=2&seed=1, see `simulation.foreign`.
 
     Args:
         address: the recording's address, starting with synthetic:.
@@ -361,7 +363,7 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             one.
 
     Returns:
-        A recording with truth (a `TrueRecording`).
+        A recording with truth (a `TrueRecording` or a `ForeignRecording`).
 
     Raises:
         RecordingError: the kind, a setting or its value is invalid, or the animal is missing.
@@ -376,6 +378,19 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     session: Recording
     if kind == "scene":
         session = _open_scene(address, stated)
+    elif kind == "foreign":
+        settings: dict[str, _Setting] = {
+            "animal": (str, KINDS.__contains__, f"one of {', '.join(KINDS)}"),
+            "body": (
+                int,
+                lambda body: 0 <= body < SEALED_BODY,
+                f"a whole number below {SEALED_BODY}",
+            ),
+            **_settings(kind, 1.0),
+        }
+        del settings["spine_mm"]
+        missing: dict[str, Any] = {"animal": "mouse", "body": 0, "seed": 0, "frames": 300}
+        session = ForeignRecording(**(missing | _values(address, stated, settings)))
     else:
         usual = "mouse" if kind in _SEQUENCES else ""
         animal = _ANIMALS.get(kind) or stated.pop("animal", usual)
