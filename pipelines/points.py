@@ -260,7 +260,7 @@ def _provenance(source: Path, points: Points, track: Track, plan: Plan) -> Prove
         far,
         sha256(source),
         plan.to_toml(),
-        f"3D points, {source.suffix}",
+        f"{source.suffix} of 3D points",
         individual=points.individual or stated.individual,
         n_frames=track.n_frames,
         gaps=find_gaps(track.times_ns, median_step(track.times_ns)),

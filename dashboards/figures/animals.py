@@ -163,11 +163,14 @@ def joints_in_image(animals: Sequence[SessionAnimal], n: int) -> list[Array]:
         n: frames of the session.
 
     Returns:
-        For each animal (n, J, 2) px; NaN without a pose.
+        For each animal (n, J, 2) px; NaN without a pose. Of imported points it is a view from
+            above.
     """
-    table = animals[0].session.table(
-        "poses", ["u_px", "v_px", *([] if animals[0].alone else ["individual"])]
-    )
+    session = animals[0].session
+    if session.metadata.get("imported"):  # no images: a view from above
+        xyz = session.pose_arrays().xyz_mm
+        return [session.camera.project(session.T_arena_camera.inverse() @ xyz)]
+    table = session.table("poses", ["u_px", "v_px", *([] if animals[0].alone else ["individual"])])
     return [
         animal.rows_of(table)[["u_px", "v_px"]].to_numpy(float).reshape(n, -1, 2)
         for animal in animals

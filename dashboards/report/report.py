@@ -369,7 +369,7 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
         found.append(
             (
                 titled(name, kept),
-                f"{value:.1%}" if share else reading(value, unit),
+                f"{value:.1%}" if share and np.isfinite(row[name]) else reading(value, unit),
                 "" if share else unit,
                 str(described.loc[name, "meaning"]),
             )
