@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from liex_lab.dashboards.figures.animals import joints_in_image, session_animals
 from liex_lab.pipelines.points import check_track, import_points, place_joints, track_of_points
 
 from liex_lab.body.skeleton import Skeleton
@@ -78,6 +79,13 @@ def test_what_needs_depth_is_absent_and_the_report_begins_with_that(session):
     assert "Depth images of one" not in page
     assert not about["thumbnails"]
     json.loads((session.path / "session.json").read_text())
+
+
+def test_the_dashboard_shows_the_points_from_above(session):
+    (uv,) = joints_in_image(session_animals(session), len(session.frames))
+    away = np.linalg.norm(np.diff(uv[:60, [0, 4]], axis=1), axis=2).ravel()
+    level = np.linalg.norm(np.diff(TRUE[:60, [0, 4], :2], axis=1), axis=2).ravel()
+    np.testing.assert_allclose(away, level, rtol=0.1)
 
 
 def test_joints_without_points_lie_on_the_curve_through_the_others():
