@@ -178,7 +178,7 @@ def read_points(path: str | Path, names: PointNames | None = None) -> Points:
     if kind not in READERS or not source.is_file():
         raise LiexError(
             f"3D points are read from {', '.join(READERS)} files, and {source} "
-            f"{'is of another kind' if source.is_file() else 'does not exist'}; name such a file"
+            f"is {'of another kind' if source.is_file() else 'not a file'}; name such a file"
         )
     try:
         return _checked(READERS[kind](source), names)
@@ -290,7 +290,8 @@ def _wide(table: pd.DataFrame, columns: _Held) -> _Held:
         LiexError,
         (
             not found,
-            f"has no columns such as nose_x, nose_y, nose_z in {', '.join(map(str, table))[:200]}",
+            "should have columns such as nose_x, nose_y and nose_z, and has "
+            f"{', '.join(map(str, table))[:200]}; rename them",
         ),
         (not whole, f"holds {_FLAT}"),
     )
@@ -317,12 +318,11 @@ def _long(columns: _Held) -> _Held:
     )
     if len({*zip(row, animal, point, strict=True)}) < len(row):
         raise LiexError("has two rows of one point in one frame; each needs its own frame")
-    points, scores = (np.full((len(times), len(animals), len(known), k), np.nan) for k in (3, 1))
-    points[row, animal, point] = np.stack([columns[axis].astype(float) for axis in "xyz"], axis=1)
-    held = {when: times, "points": points, "names": known}
-    if "score" in columns:
-        scores[row, animal, point, 0] = columns["score"].astype(float)
-        held["scores"] = scores[..., 0]
+    values = [columns[name].astype(float) for name in (*"xyz", "score") if name in columns]
+    points = np.full((len(times), len(animals), len(known), len(values)), np.nan)
+    points[row, animal, point] = np.stack(values, axis=1)
+    scores = points[..., 3] if "score" in columns else None
+    held = {when: times, "points": points[..., :3], "names": known, "scores": scores}
     return held | ({"individuals": animals} if "individual" in columns else {})
 
 

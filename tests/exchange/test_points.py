@@ -142,7 +142,7 @@ def test_two_animals_need_a_choice_and_a_table_without_z_is_refused(tmp_path):
     flat.to_csv(tmp_path / "flat.csv", index=False)
     with pytest.raises(LiexError, match="holds 2D points"):
         read_points(tmp_path / "flat.csv", PointNames(fps=20.0))
-    with pytest.raises(LiexError, match="does not exist"):
+    with pytest.raises(LiexError, match="is not a file"):
         read_points(tmp_path / "none.csv")
 
 
