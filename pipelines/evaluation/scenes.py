@@ -272,6 +272,10 @@ def evaluate_foreign(
             "--frames and --sealed belong to the project's own bodies; leave them out",
         ),
         (
+            truth is not None and not Path(truth).exists(),
+            f"there is no folder or truth file {truth}; check the path",
+        ),
+        (
             truth is None and animal not in KINDS,
             f"the project's own foreign bodies are of {' and '.join(KINDS)}, not of '{animal}'; "
             "give recordings with truth files by --truth",

@@ -187,7 +187,7 @@ def test_files_that_are_no_truth_are_refused_in_one_sentence(given, tmp_path):
     (tmp_path / "b1.mcap").unlink()
     with pytest.raises(LiexError, match="no recording beside"):
         scenes.evaluate_foreign("fish", truth=file)
-    with pytest.raises(LiexError, match="no recording beside"):
+    with pytest.raises(LiexError, match="check the path"):
         scenes.evaluate_foreign("fish", truth=tmp_path / "absent")
 
 
