@@ -221,7 +221,7 @@ def evaluate_pose(
     progress: Progress,
 ) -> Result:
     """Measure joint errors on a split (other-build and foreign: whole tracks)."""
-    tracks = {"other-build": api.evaluate_builds, "foreign": api.evaluate_foreign}.get(split)
+    tracks = {"other-build": "evaluate_builds", "foreign": "evaluate_foreign"}.get(split)
     refuse(
         LiexError,
         (
@@ -233,7 +233,8 @@ def evaluate_pose(
     )
     if tracks:
         more = {"truth": truth} if split == "foreign" else {}
-        return tracks(animal, n_frames=n_frames, sealed=sealed, progress=progress, **more)
+        measure: Callable[..., Result] = getattr(api, tracks)
+        return measure(animal, n_frames=n_frames, sealed=sealed, progress=progress, **more)
     return api.evaluate_pose(
         animal,
         split,

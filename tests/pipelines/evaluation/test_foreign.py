@@ -4,6 +4,7 @@ recording is refused in one sentence.
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ N, LENGTH_MM = 40, 65.0
 FOREIGN = REFERENCE_DATA / "foreign"
 
 
-def arrays(n_joints: int = 9) -> dict[str, np.ndarray]:
+def arrays(n_joints: int = 9) -> dict[str, Any]:
     """The truth of a straight body that turns around, 20 mm thick, its joints near the belly."""
     yaw = np.linspace(0.0, 3.0, N)[:, None]
     s = np.linspace(-0.5, 0.5, n_joints) * LENGTH_MM
