@@ -107,9 +107,9 @@ _TAIL = 0.005  # quantile of a clue in training at which it is clipped
 # of a clue's range in training: bodies of its families stay within half of this
 _FAR = 0.25
 # standard deviations for a body unlike those of the training: of the logarithm of its height, and
-# of the joints' height over the length
+# of the joints' height over the length: the root mean square over four foreign fish
 _UNLIKE_SD = 0.35
-_UNLIKE_UNSEEN = 0.04
+_UNLIKE_UNSEEN = 0.033
 _BACKS = 8  # groups of stations in which the height of the back is a clue
 
 
