@@ -52,7 +52,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     # used by the command line only
     "evaluate_pose": "evaluation.pose",
     "evaluate_builds": "evaluation.pose",
-    "evaluate_foreign": "evaluation.scenes",
+    "evaluate_foreign": "evaluation.foreign",
     "evaluate_sizes": "evaluation.pose",
     "evaluate_reference": "evaluation.pose",
     "evaluate_speed": "evaluation.speed",

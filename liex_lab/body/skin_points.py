@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 from liex_lab.body._skinning_kernels import BODY_SEGMENTS
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
-from liex_lab.body.skeleton import PRESETS, Skeleton
+from liex_lab.body.skeleton import PRESETS, Array, Skeleton
 from liex_lab.errors import LiexError, refuse
-
-Array = NDArray[np.float64]
 
 _KEYS = {"name", "mabe", "station", "angle_deg", "sd_mm"}
 

@@ -78,13 +78,19 @@ class OwnShape:
 
     def caution(self, length_mm: float) -> str:
         """A sentence for the user if the body is unlike those of the training, else empty."""
-        if not self.unlike or self.unseen is None:
+        if not self.unlike:
             return ""
-        off_mm = self.unseen[0] * length_mm
         return (
             "the body is unlike those that shapes were learned from: its height is assumed, not "
-            f"measured, and the depth of all joints may be off by {off_mm:.1f} mm"
+            "measured, and the depth of all joints may be off by "
+            f"{self.shared_error_mm(length_mm):.1f} mm"
         )
+
+    def shared_error_mm(self, length_mm: float) -> float:
+        """Deviation in depth that all frames share, mm, if the body is unlike those of the
+        training, else 0: it cautions against the session, and makes no frame doubtful.
+        """
+        return self.unseen[0] * length_mm if self.unlike and self.unseen else 0.0
 
     def corrected(self, estimator: PoseEstimator, pose: Pose, size: float) -> Pose:
         """Poses minus the mean error of such a body; unchanged if it is unknown.

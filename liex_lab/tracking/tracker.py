@@ -170,21 +170,17 @@ class FrameTracker:
         """The animal of the track, with the limits and shares of this recording."""
         skeleton = self.estimator.skeleton
         share = self.estimator.model.calibration.joint_share or (1.0,) * skeleton.n_joints
-        unseen = None if self.shape is None else self.shape.unseen
-        limit_mm = self.doubtful_mm
-        if unseen is not None and self.shape and self.shape.unlike:
-            # an error of all frames is a caution for the session; it makes no frame doubtful
-            limit_mm = math.hypot(limit_mm, unseen[0] * self.spine_mm)
+        shared_mm = 0.0 if self.shape is None else self.shape.shared_error_mm(self.spine_mm)
         return Subject(
             skeleton,
             self.scene.camera,
             self.scene.floor.T_arena_camera,
             self.spine_mm,
-            limit_mm,
+            math.hypot(self.doubtful_mm, shared_mm),
             self.bridge_s,
             share,
             TrackingParameters.of(skeleton.name).motion.stretch_sd(self.blur, self.size_spread),
-            unseen,
+            None if self.shape is None else self.shape.unseen,
             1 if self.sample_fit is None else self.sample_fit.n_animals,
         )
 

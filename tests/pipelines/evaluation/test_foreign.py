@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from liex_lab.pipelines.convert import convert
-from liex_lab.pipelines.evaluation import scenes
+from liex_lab.pipelines.evaluation import foreign
 from typer.testing import CliRunner
 
 from liex_lab import cli
@@ -52,7 +52,7 @@ class Recorded:
 
 
 def truth(**changed: np.ndarray):
-    return scenes.truth_of(arrays() | changed, "a_truth.npz", Recorded(), SHARES)
+    return foreign.truth_of(arrays() | changed, "a_truth.npz", Recorded(), SHARES)
 
 
 def measured(across: float = 0.0, along: float = 0.0, deep: float = 0.0) -> MeasuredIndividual:
@@ -72,12 +72,12 @@ def test_the_curve_is_resampled_at_our_joints_in_the_middle_of_the_body():
     np.testing.assert_allclose(found.joints_camera[..., 2], 633.0)
     arc = np.linalg.norm(np.diff(found.joints_camera[..., :2], axis=1), axis=-1)
     np.testing.assert_allclose(np.cumsum(arc, axis=1), LENGTH_MM * SHARES[1:][None].repeat(N, 0))
-    coarse = scenes.truth_of(arrays(2), "b", Recorded(), SHARES)
+    coarse = foreign.truth_of(arrays(2), "b", Recorded(), SHARES)
     np.testing.assert_allclose(coarse.joints_camera, found.joints_camera)
 
 
 def test_errors_across_along_and_in_depth_are_found_apart():
-    figures = scenes.body_figures(truth(), measured(2.0, -5.0, 4.0), MOUSE)
+    figures = foreign.body_figures(truth(), measured(2.0, -5.0, 4.0), MOUSE)
     assert figures["across_mm"] == pytest.approx(2.0, abs=0.01)
     assert figures["depth_mm"] == pytest.approx(4.0, abs=0.01)
     assert figures["depth_bias_mm"] == pytest.approx(4.0, abs=0.01)
@@ -94,7 +94,7 @@ def test_errors_across_along_and_in_depth_are_found_apart():
 def test_intervals_are_of_the_arenas_axes():
     one = measured(deep=4.0)
     turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    figures = scenes.body_figures(truth(), replace(one, R_arena_camera=turned), MOUSE)
+    figures = foreign.body_figures(truth(), replace(one, R_arena_camera=turned), MOUSE)
     assert [figures[f"interval90_{axis}"] for axis in "xyz"] == [0.0, 1.0, 1.0]
 
 
@@ -102,7 +102,7 @@ def test_exchanged_ends_do_not_shift_the_constant_and_are_wrong_where_trusted():
     one = measured(along=2.0)
     one.joints_camera[:10] = one.joints_camera[:10, ::-1]
     one.trusted[5:] = False
-    figures = scenes.body_figures(truth(), one, MOUSE)
+    figures = foreign.body_figures(truth(), one, MOUSE)
     assert figures["flips"] == pytest.approx(10 / N)
     assert figures["along_constant_mm"]["nose"] == pytest.approx(2.0, abs=0.01)
     assert (figures["trusted"], figures["trusted_and_wrong"]) == (5 / N, 1.0)
@@ -115,7 +115,7 @@ def test_hidden_frames_and_joints_without_a_surface_count_for_nothing():
     one = measured(across=1.0)
     one.joints_camera[:8] += 300.0
     one.trusted[:8] = False
-    figures = scenes.body_figures(truth(surface_mm=surface, visible_fraction=visible), one, MOUSE)
+    figures = foreign.body_figures(truth(surface_mm=surface, visible_fraction=visible), one, MOUSE)
     assert figures["error_mm"] == pytest.approx(1.0, abs=0.01)
     assert figures["trusted_and_wrong"] == 0.0
 
@@ -142,7 +142,7 @@ def test_a_truth_that_does_not_fit_its_recording_is_refused(changed, expected):
 def test_a_missing_array_is_named():
     some = {name: one for name, one in arrays().items() if name == "joints"}
     with pytest.raises(LiexError, match="lacks the array surface_mm, thickness_mm"):
-        scenes.truth_of(some, "a_truth.npz", Recorded(), SHARES)
+        foreign.truth_of(some, "a_truth.npz", Recorded(), SHARES)
 
 
 # folders of recordings
@@ -160,8 +160,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_recordings_with_a_truth_file_are_scored_and_others_named(given, monkeypatch):
-    monkeypatch.setattr(scenes, "run_product", lambda *_: ([], ["no floor was found"], 1))
-    result = scenes.evaluate_foreign("mouse", truth=given)
+    monkeypatch.setattr(foreign, "run_product", lambda *_: ([], ["no floor was found"], 1))
+    result = foreign.evaluate_foreign("mouse", truth=given)
     assert list(result["rows"]) == ["b1"]
     row = result["rows"]["b1"]
     assert (row["found"], row["said"], row["exit_code"]) == (0.0, ["no floor was found"], 1)
@@ -172,7 +172,7 @@ def test_recordings_with_a_truth_file_are_scored_and_others_named(given, monkeyp
 
 def test_a_body_of_another_length_than_the_plans_is_left_out(given):
     with pytest.raises(LiexError, match=r"65 mm long, and a fish has 18 to .*--animal"):
-        scenes.evaluate_foreign("fish", truth=given)
+        foreign.evaluate_foreign("fish", truth=given)
 
 
 def test_files_that_are_no_truth_are_refused_in_one_sentence(given, tmp_path):
@@ -183,13 +183,13 @@ def test_files_that_are_no_truth_are_refused_in_one_sentence(given, tmp_path):
     for content, expected in (*bad, (b"", "should be a truth file")):
         file.write_bytes(content)
         with pytest.raises(LiexError, match=expected) as error:
-            scenes.evaluate_foreign("fish", truth=file)
+            foreign.evaluate_foreign("fish", truth=file)
         assert "\n" not in str(error.value)
     (tmp_path / "b1.mcap").unlink()
     with pytest.raises(LiexError, match="no recording beside"):
-        scenes.evaluate_foreign("fish", truth=file)
+        foreign.evaluate_foreign("fish", truth=file)
     with pytest.raises(LiexError, match="check the path"):
-        scenes.evaluate_foreign("fish", truth=tmp_path / "absent")
+        foreign.evaluate_foreign("fish", truth=tmp_path / "absent")
 
 
 @pytest.mark.parametrize(
@@ -212,23 +212,23 @@ def test_own_bodies_are_scored_and_sealed_ones_are_others(monkeypatch):
 
     def pretend(recording, plan):
         taken.append(recording.name)
-        joints = scenes.truth_of(recording.truth, "", recording, SHARES).joints_camera
+        joints = foreign.truth_of(recording.truth, "", recording, SHARES).joints_camera
         joints = np.nan_to_num(joints, nan=600.0) + 0.01
         sd = np.full(joints.shape, 1.0)
         return [MeasuredIndividual(joints, np.ones(2, np.bool_), sd, np.ones(2))], [], 0
 
-    monkeypatch.setattr(scenes, "run_product", pretend)
-    monkeypatch.setitem(scenes.KINDS["mouse"], "n_bodies", 2)
-    result = scenes.evaluate_foreign("mouse", n_frames=2)
+    monkeypatch.setattr(foreign, "run_product", pretend)
+    monkeypatch.setitem(foreign.KINDS["mouse"], "n_bodies", 2)
+    result = foreign.evaluate_foreign("mouse", n_frames=2)
     assert result["summary"]["depth_mm"] == pytest.approx(0.01)
     assert result["summary"]["depth_mm95"] is not None
-    assert scenes.evaluate_foreign("mouse", n_frames=2, sealed=True)["bodies"] == "sealed"
+    assert foreign.evaluate_foreign("mouse", n_frames=2, sealed=True)["bodies"] == "sealed"
     assert len(set(taken)) == 4
 
 
 @pytest.mark.nightly
 @pytest.mark.skipif(not FOREIGN.is_dir(), reason="foreign recordings are not beside the project")
 def test_given_foreign_bodies_are_measured():
-    result = scenes.evaluate_foreign("fish", truth=FOREIGN / "fish28_truth.npz")
+    result = foreign.evaluate_foreign("fish", truth=FOREIGN / "fish28_truth.npz")
     assert result["rows"]["fish28"]["found"] > 0.9
     assert result["rows"]["fish28"]["across_mm"] < 2.0
