@@ -136,9 +136,16 @@ def did_you_mean(word: object, known: Iterable[str], form: str = "did you mean '
 def one_line(error: BaseException) -> str:
     """First line of another package's error message, for use in a sentence.
 
-    At most 200 characters; the type's name replaces an empty message.
+    At most 200 characters; the type's name replaces an empty message. Of several errors of pydantic
+    it is the first one: where, and what was expected.
     """
-    return str(error).strip().partition("\n")[0][:200] or type(error).__name__
+    text = str(error)
+    if isinstance(error, ValueError) and hasattr(error, "errors"):
+        first = error.errors(include_url=False, include_input=False)[0]
+        what = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
+        where = ".".join(str(part) for part in first["loc"])
+        text = ascii(f"{where} {what}".strip())[1:-1]
+    return text.strip().partition("\n")[0][:200] or type(error).__name__
 
 
 def refuse(kind: type[Exception], *checks: tuple[object, str]) -> None:

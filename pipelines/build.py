@@ -491,15 +491,8 @@ def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:
             f"{skeleton.name} has {skeleton.n_joints}; take animal.shared of a session of this "
             "skeleton, or leave it out"
         )
-    return StatedShape(shape_labels(shape), shared.girth, shared.by)
-
-
-def shape_labels(shape: sections.SharedShape) -> NDArray[np.float64]:
-    """A plan's shape as (K,) labels, see `session_shape.labels_of`."""
-    import numpy as np
-
-    columns = (np.array(column) for column in (shape.joints_moved, shape.width, shape.height))
-    return labels_of(*columns)
+    labels = labels_of(shape.joints_moved, shape.width, shape.height)
+    return StatedShape(labels, shared.girth, shared.by)
 
 
 def build_scene(

@@ -110,8 +110,7 @@ def track_of_points(
     for column in joints.reshape(len(joints), -1).T:
         column[bridged] = np.interp(seconds[bridged], seconds[measured], column[measured])
     used = [points.names.index(name) for names in mapped.values() for name in names]
-    sure = np.ones((len(joints), 1)) if points.scores is None else points.scores[:, used]
-    flag = np.where(sure.mean(axis=1) < _TRUSTED, "doubtful", "")
+    sure = np.ones(len(joints)) if points.scores is None else points.scores[:, used].mean(axis=1)
     pose = Pose.from_joints(skeleton, joints, [0.0, 0.0, 1.0])
     return replace(
         Track.empty(skeleton, np.round(seconds * 1e9).astype(np.int64)),
@@ -122,7 +121,7 @@ def track_of_points(
         scale=pose.scale,
         centroid_mm=joints.mean(axis=1),
         bridged=bridged,
-        flag=np.where(measured, flag, "not_found").astype("<U12"),
+        flag=np.where(measured, np.where(sure < _TRUSTED, "doubtful", ""), "not_found"),
     )
 
 
@@ -207,8 +206,8 @@ def import_points(
             f"points are imported for one chain of joints, and a {skeleton.name} has limbs; choose "
             "the plan of another animal"
         )
-    rules = ["actions.model=rules"] * (plan.actions.model is None and skeleton.name == "mouse")
-    plan = plan.with_settings(["replay.depth=none", *rules])
+    is_ruled = plan.actions.model is None and skeleton.name == "mouse"
+    plan = plan.with_settings(["replay.depth=none", *["actions.model=rules"] * is_ruled])
     folder = durable.inside(Path(out), plan.session.name or source.stem, ".liex")
     check_unused(folder, overwrite)
     progress(0, None, "reading the points")
@@ -219,7 +218,6 @@ def import_points(
     check_track(track, plan)
     n_posed, n_trusted = int(track.observed.sum()), int((track.flag == "").sum())
     derived = [joint for joint in skeleton.names if joint not in mapped]
-    placed = f"Joints without points lie on the curve through the others: {', '.join(derived)}."
     with SessionWriter(
         folder,
         _provenance(source, points, track, plan),
@@ -231,7 +229,14 @@ def import_points(
         writer.track = track
         writer.note(
             input=evidence.link_to(source, folder),
-            problems=[_NO_DEPTH.format(file=source.name), *([placed] if derived else [])],
+            problems=[
+                _NO_DEPTH.format(file=source.name),
+                *[
+                    "Joints without points lie on the curve through the others: "
+                    f"{', '.join(derived)}."
+                ]
+                * bool(derived),
+            ],
             verdict=Verdict(track.n_frames, n_posed, n_posed, n_trusted, None, 1).to_dict(),
             imported={
                 "joints": mapped,
@@ -240,8 +245,7 @@ def import_points(
                 "floor_origin": "estimated" if table.floor is None else "stated",
             },
         )
-        timings_s = {"prepare": time.perf_counter() - started, "track": 0.0}
-        return conclude(writer, plan, timings_s).path
+        return conclude(writer, plan, {"prepare": time.perf_counter() - started, "track": 0.0}).path
 
 
 def _provenance(source: Path, points: Points, track: Track, plan: Plan) -> Provenance:

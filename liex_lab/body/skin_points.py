@@ -13,134 +13,129 @@ of the joints, and w_j the weights of linear interpolation along the spine.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter
 
 from liex_lab.body._skinning_kernels import BODY_SEGMENTS
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import PRESETS, Array, Skeleton
-from liex_lab.errors import LiexError, refuse
+from liex_lab.errors import LiexError, one_line, refuse
+from liex_lab.plan.sections import Positive, SettingsTable, first_twice
 
-_KEYS = {"name", "mabe", "station", "angle_deg", "sd_mm"}
+
+class SkinPoint(SettingsTable):
+    """A point on the trunk of a tubular animal: an entry of a skeleton's list `points`."""
+
+    name: str
+    mabe: str = Field("", description="name in the MABe challenge; '' if it is the same")
+    station: float = Field(description="along the body, share of the spine's length")
+    angle_deg: float = Field(description="around the mid-axis: 0 left, 90 up, 180 right")
+    sd_mm: list[Positive] = Field(
+        min_length=3,
+        max_length=3,
+        description="standard deviation of the place, forward, left and up, at scale 1",
+    )
 
 
-@dataclass(frozen=True)
-class SurfacePoints:
-    """M points on the trunk of a tubular animal.
+def points_of(skeleton: Skeleton) -> list[SkinPoint]:
+    """The points of a skeleton, or of the preset of its name if it states none.
 
-    Attributes:
-        names: M names.
-        mabe: M names of the MABe challenge.
-        station: (M,) along the body, shares of the spine's length.
-        turn: (M,) rad, the ellipse's parameter around the mid-axis: 0 left, pi / 2 up, pi right.
-        sd_mm: (M, 3) standard deviations of the place, forward, left and up, mm at scale 1.
+    Models and sessions of earlier versions contain the preset's skeleton without its points.
+
+    Raises:
+        LiexError: there are no points, or they are incomplete or out of range.
     """
-
-    names: tuple[str, ...]
-    mabe: tuple[str, ...]
-    station: Array
-    turn: Array
-    sd_mm: Array
-
-    @staticmethod
-    def of(skeleton: Skeleton) -> SurfacePoints:
-        """The points of a skeleton, or of the preset of its name if it states none.
-
-        Models and sessions of earlier versions contain the preset's skeleton without its points.
-
-        Raises:
-            LiexError: there are no points, or they are incomplete or out of range.
-        """
-        stated = skeleton.table.get("points")
-        if stated is None and (PRESETS / f"{skeleton.name}.toml").is_file():
-            preset = Skeleton.load(skeleton.name)
-            stated = preset.table.get("points") if preset.names == skeleton.names else None
-        if not stated or "stations" not in skeleton.surface:
-            raise LiexError(
-                "points on the skin need a skeleton that lists them (`points`) and whose [surface] "
-                f"has stations, as the bundled mouse; '{skeleton.name}' does not"
-            )
-        where = f"the points of the skeleton '{skeleton.name}'"
-        try:
-            unknown = {key for row in stated for key in row} - _KEYS
-            names = tuple(str(row["name"]) for row in stated)
-            mabe = tuple(str(row.get("mabe", row["name"])) for row in stated)
-            place = np.array([[row["station"], row["angle_deg"]] for row in stated], float)
-            sd = np.array([row["sd_mm"] for row in stated], float)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise LiexError(f"{where} are incomplete: {error}") from None
-        first, *_, last = skeleton.surface["stations"]
+    stated = skeleton.table.get("points")
+    if stated is None and (PRESETS / f"{skeleton.name}.toml").is_file():
+        preset = Skeleton.load(skeleton.name)
+        stated = preset.table.get("points") if preset.names == skeleton.names else None
+    if not stated or "stations" not in skeleton.surface:
+        raise LiexError(
+            "points on the skin need a skeleton that lists them (`points`) and whose [surface] "
+            f"has stations, as the bundled mouse; '{skeleton.name}' does not"
+        )
+    first, *_, last = skeleton.surface["stations"]
+    try:
+        points = TypeAdapter(list[SkinPoint]).validate_python(stated)
+        twice = first_twice(one.name for one in points)
         refuse(
-            LiexError,
-            (unknown, f"{where} have unknown keys {sorted(unknown)}; use {sorted(_KEYS)}"),
-            (len(set(names)) != len(names), f"{where} need different names, got {list(names)}"),
-            (
-                not ((first <= place[:, 0]) & (place[:, 0] <= last)).all(),
-                f"{where} need stations from {first} to {last}, got {place[:, 0].tolist()}",
-            ),
-            (not np.isfinite(place).all(), f"{where} need an angle_deg that is a finite number"),
-            (
-                sd.shape != (len(names), 3) or not (np.isfinite(sd) & (sd > 0)).all(),
-                f"{where} need an sd_mm of three positive numbers: forward, left, up",
+            ValueError,
+            (twice, f"{twice} is listed twice"),
+            *(
+                (
+                    not first <= one.station <= last,
+                    f"{one.name} needs a station from {first} to {last}, got {one.station}",
+                )
+                for one in points
             ),
         )
-        return SurfacePoints(names, mabe, place[:, 0], np.radians(place[:, 1]), sd)
+    except ValueError as error:
+        raise LiexError(
+            f"the points of the skeleton '{skeleton.name}' cannot be used: {one_line(error)}; "
+            "correct the list"
+        ) from None
+    return points
 
-    def placed(
-        self, surface: Surface, pose: Pose, girth: Array, sd_joints: Array
-    ) -> tuple[Array, Array]:
-        """The points in many poses.
 
-        Args:
-            surface: the animal's, a tube.
-            pose: (n) poses.
-            girth: (n,) factor of all lengths across the body.
-            sd_joints: (n, J, 3) mm, standard deviations of the joints along x, y and z.
+def place_points(
+    points: Sequence[SkinPoint], surface: Surface, pose: Pose, girth: Array, sd_joints: Array
+) -> tuple[Array, Array]:
+    """Skin points in many poses.
 
-        Returns:
-            Positions (n, M, 3) mm in the poses' frame, and standard deviations (n, M, 3) mm.
-        """
-        skeleton = surface.skeleton
-        corner, weight = self.on_mesh(surface)
-        vertices = surface.vertices(pose, girth=girth)
-        joint_at = skeleton.reach / skeleton.length
-        carrier = np.clip(
-            np.searchsorted(joint_at, self.station, side="right") - 1, 0, skeleton.n_joints - 2
-        )
-        along = np.stack(
-            [np.interp(self.station, joint_at, unit) for unit in np.eye(len(joint_at))]
-        )
-        own = np.einsum("jm,njd->nmd", along, sd_joints)
-        axes = pose.frames(skeleton).rotation[:, carrier]
-        stated = pose.scale[:, None, None] * self.sd_mm
-        spread = np.sqrt(own**2 + np.einsum("nmdk,nmk->nmd", axes**2, stated**2))
-        return np.einsum("mc,nmcd->nmd", weight, vertices[:, corner]), spread
+    Args:
+        points: the M points.
+        surface: the animal's, a tube.
+        pose: (n) poses.
+        girth: (n,) factor of all lengths across the body.
+        sd_joints: (n, J, 3) mm, standard deviations of the joints along x, y and z.
 
-    def on_mesh(self, surface: Surface) -> tuple[NDArray[np.int64], Array]:
-        """Vertices (M, 4) of the trunk around each point, and their barycentric weights (M, 4).
+    Returns:
+        Positions (n, M, 3) mm in the poses' frame, and standard deviations (n, M, 3) mm.
+    """
+    skeleton = surface.skeleton
+    corner, weight = on_mesh(points, surface)
+    station = [one.station for one in points]
+    vertices = surface.vertices(pose, girth=girth)
+    joint_at = skeleton.reach / skeleton.length
+    carrier = np.clip(
+        np.searchsorted(joint_at, station, side="right") - 1, 0, skeleton.n_joints - 2
+    )
+    along = np.stack([np.interp(station, joint_at, unit) for unit in np.eye(len(joint_at))])
+    own = np.einsum("jm,njd->nmd", along, sd_joints)
+    axes = pose.frames(skeleton).rotation[:, carrier]
+    stated = pose.scale[:, None, None] * np.array([one.sd_mm for one in points])
+    spread = np.sqrt(own**2 + np.einsum("nmdk,nmk->nmd", axes**2, stated**2))
+    return np.einsum("mc,nmcd->nmd", weight, vertices[:, corner]), spread
 
-        Three of the four weights are those of a triangle of the mesh, the other one is 0.
 
-        Args:
-            surface: the animal's, a tube.
-        """
-        stations = surface.stations
-        last = len(stations) - 2
-        ring = np.clip(np.searchsorted(stations, self.station, side="right") - 1, 0, last)
-        s = (self.station - stations[ring]) / (stations[ring + 1] - stations[ring])
-        segment, t = np.divmod(self.turn / (2.0 * np.pi) * BODY_SEGMENTS, 1.0)
-        # a quad of two rings and two segments, cut along the diagonal as in `tube_faces`
-        r = ring[:, None] + [0, 0, 1, 1]
-        k = segment.astype(np.int64)[:, None] + [0, 1, 0, 1]
-        corner = 1 + (r - 1) * BODY_SEGMENTS + k % BODY_SEGMENTS
-        weight = [
-            1.0 - np.maximum(s, t),
-            np.maximum(t - s, 0.0),
-            np.maximum(s - t, 0.0),
-            np.minimum(s, t),
-        ]
-        # the first and last rings are poles
-        return np.clip(corner, 0, surface.n_trunk_vertices - 1), np.stack(weight, axis=-1)
+def on_mesh(points: Sequence[SkinPoint], surface: Surface) -> tuple[NDArray[np.int64], Array]:
+    """Vertices (M, 4) of the trunk around each point, and their barycentric weights (M, 4).
+
+    Three of the four weights are those of a triangle of the mesh, the other one is 0.
+
+    Args:
+        points: the M points.
+        surface: the animal's, a tube.
+    """
+    stations = surface.stations
+    station, angle_deg = np.array([(one.station, one.angle_deg) for one in points]).T
+    last = len(stations) - 2
+    ring = np.clip(np.searchsorted(stations, station, side="right") - 1, 0, last)
+    s = (station - stations[ring]) / (stations[ring + 1] - stations[ring])
+    segment, t = np.divmod(angle_deg / 360.0 * BODY_SEGMENTS, 1.0)
+    # a quad of two rings and two segments, cut along the diagonal as in `tube_faces`
+    r = ring[:, None] + [0, 0, 1, 1]
+    k = segment.astype(np.int64)[:, None] + [0, 1, 0, 1]
+    corner = 1 + (r - 1) * BODY_SEGMENTS + k % BODY_SEGMENTS
+    weight = [
+        1.0 - np.maximum(s, t),
+        np.maximum(t - s, 0.0),
+        np.maximum(s - t, 0.0),
+        np.minimum(s, t),
+    ]
+    # the first and last rings are poles
+    return np.clip(corner, 0, surface.n_trunk_vertices - 1), np.stack(weight, axis=-1)

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape, Surface
@@ -285,7 +285,7 @@ def outline_labels(skeleton: Skeleton, clues: Array) -> Array:
     return labels_of(offset, np.clip(width, 0.5, 2.0), np.full(len(places), broad)).round(9)
 
 
-def labels_of(offset: Array, width: Array, height: Array) -> Array:
+def labels_of(offset: ArrayLike, width: ArrayLike, height: ArrayLike) -> Array:
     """Labels of a session for `ShapePrior`.
 
     Args:
@@ -293,7 +293,7 @@ def labels_of(offset: Array, width: Array, height: Array) -> Array:
         width: (P,) half widths over the average animal's at `PLACES`.
         height: (P,) half heights likewise.
     """
-    return np.concatenate([offset.ravel(), np.log(width), np.log(height)])
+    return np.concatenate([np.ravel(offset), np.log(width), np.log(height)])
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,12 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from liex_lab.errors import LiexError, did_you_mean, how_to_install, one_line, refuse
 from liex_lab.plan.sections import Positive, SettingsTable
 from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.text_files import read_text, read_toml, split_lines
-from liex_lab.sessions.provenance import first_error
 
 Array = NDArray[np.float64]
 Names = str | list[str]
@@ -74,14 +73,15 @@ class PointNames(SettingsTable):
         Raises:
             LiexError: the file cannot be read, or an entry is unknown or invalid.
         """
-        own = {name: value for name, value in stated.items() if value is not None}
         try:
-            return PointNames.model_validate(({} if path is None else read_toml(Path(path))) | own)
+            return PointNames.model_validate(
+                ({} if path is None else read_toml(Path(path)))
+                | {name: value for name, value in stated.items() if value is not None}
+            )
         except (OSError, ValueError) as error:
-            why = first_error(error) if isinstance(error, ValidationError) else one_line(error)
             raise LiexError(
                 f"the table of names {path or ''} should be a TOML file with any of "
-                f"{', '.join(PointNames.model_fields)}, but: {why}; correct it"
+                f"{', '.join(PointNames.model_fields)}, but: {one_line(error)}; correct it"
             ) from None
 
     def of_joints(self, joints: Sequence[str], points: Sequence[str]) -> dict[str, list[str]]:
@@ -97,8 +97,8 @@ class PointNames(SettingsTable):
         Raises:
             LiexError: a joint or a point does not exist, or an end of the chain has no point.
         """
-        plain = {re.sub(r"[\W_]", "", name).lower(): name for name in points}
-        alike = {_SYNONYMS.get(name, name): point for name, point in plain.items()}
+        plain = [re.sub(r"[\W_]", "", name).lower() for name in points]
+        alike = {_SYNONYMS.get(k, k): point for k, point in zip(plain, points, strict=True)}
         stated = self.joints or {joint: alike[joint] for joint in joints if joint in alike}
         found = {
             joint: [names] if isinstance(names, str) else names
@@ -201,9 +201,8 @@ def _checked(held: _Held, names: PointNames) -> Points:
     labels = labels or [f"point_{k + 1}" for k in range(several.shape[2])]
     chosen = names.individual or (known[0] if len(known) == 1 else None)
     times, frames = held.get("time_s"), held.get("frames", np.arange(len(several)))
-    stated = times is not None or names.fps is not None
-    time_s = np.asarray(frames if times is None else times, float)
-    time_s = time_s if times is not None else time_s / (names.fps or 1.0)
+    time_s = np.asarray(frames, float) / (names.fps or 1.0)
+    time_s = time_s if times is None else np.asarray(times, float)
     refuse(
         LiexError,
         (several.shape[-1] != 3, f"holds {_FLAT}"),
@@ -216,7 +215,10 @@ def _checked(held: _Held, names: PointNames) -> Points:
             f"has {several.shape[2]} points, and the names {', '.join(labels)}; each point needs a "
             "name of its own",
         ),
-        (not stated, "has no times, and the frame rate is needed; state it with --fps"),
+        (
+            times is None and names.fps is None,
+            "has no times, and the frame rate is needed; state it with --fps",
+        ),
         (len(several) < _FEWEST, f"has {len(several)} frames, and {_FEWEST} are needed"),
         (
             time_s.shape != several.shape[:1],
@@ -238,8 +240,11 @@ def _checked(held: _Held, names: PointNames) -> Points:
         (not len(heights), "has no point in any frame; check the file"),
         (len(heights) and np.ptp(heights) == 0.0, f"has one height for all points: {_FLAT}"),
     )
-    estimated = float(np.nanquantile(np.fmin.reduce(points[..., 2], axis=1), 0.05))
-    floor = estimated if names.floor is None else names.floor * _UNITS_MM[names.unit]
+    floor = (
+        float(np.nanquantile(np.fmin.reduce(points[..., 2], axis=1), 0.05))
+        if names.floor is None
+        else names.floor * _UNITS_MM[names.unit]
+    )
     points[..., 2] -= floor
     scores, words = held.get("scores"), held.get("words")
     return Points(
@@ -298,8 +303,12 @@ def _wide(table: pd.DataFrame, columns: _Held) -> _Held:
     points = np.stack([table[[found[k, a] for a in "xyz"]].to_numpy(float) for k in whole], axis=1)
     stated = [[f"{k}_{word}" for k in whole] for word in _COLUMNS["score"]]
     scores = [table[one].to_numpy(float)[:, None] for one in stated if {*one} <= {*table}]
-    when = {name: columns[name] for name in ("time_s", "frames") if name in columns}
-    return {"points": points[:, None], "names": whole, "scores": [*scores, None][0], **when}
+    return {
+        "points": points[:, None],
+        "names": whole,
+        "scores": [*scores, None][0],
+        **{name: columns[name] for name in ("time_s", "frames") if name in columns},
+    }
 
 
 def _long(columns: _Held) -> _Held:
@@ -311,19 +320,23 @@ def _long(columns: _Held) -> _Held:
         (lacking == ["z"], f"holds {_FLAT}"),
         (lacking or not when, "should have the columns frame or time, keypoint, x, y and z"),
     )
-    names = [columns["point"], columns.get("individual", np.zeros(len(columns["point"])))]
+    alone = np.zeros(len(columns["point"]))
     (times, row), (known, point), (animals, animal) = (
         np.unique(column if column.dtype.kind in "if" else column.astype(str), return_inverse=True)
-        for column in (columns[when], *names)
+        for column in (columns[when], columns["point"], columns.get("individual", alone))
     )
     if len({*zip(row, animal, point, strict=True)}) < len(row):
         raise LiexError("has two rows of one point in one frame; each needs its own frame")
     values = [columns[name].astype(float) for name in (*"xyz", "score") if name in columns]
     points = np.full((len(times), len(animals), len(known), len(values)), np.nan)
     points[row, animal, point] = np.stack(values, axis=1)
-    scores = points[..., 3] if "score" in columns else None
-    held = {when: times, "points": points[..., :3], "names": known, "scores": scores}
-    return held | ({"individuals": animals} if "individual" in columns else {})
+    return {
+        when: times,
+        "points": points[..., :3],
+        "names": known,
+        "scores": points[..., 3] if "score" in columns else None,
+        **({"individuals": animals} if "individual" in columns else {}),
+    }
 
 
 def _read_movement(path: Path) -> _Held:
@@ -333,13 +346,14 @@ def _read_movement(path: Path) -> _Held:
     held = xarray.load_dataset(path, engine="h5netcdf")
     held = held.rename({name: f"{name}s" for name in ("keypoint", "individual") if name in held})
     order = ("time", "individuals", "keypoints")
-    counted = str(held.attrs.get("time_unit", "seconds")).startswith("frame")
     return {
         "points": held["position"].transpose(*order, "space").to_numpy(),
         "names": held["keypoints"].to_numpy(),
         "individuals": held["individuals"].to_numpy(),
         "scores": held["confidence"].transpose(*order).to_numpy() if "confidence" in held else None,
-        "frames" if counted else "time_s": held["time"].to_numpy(),
+        "frames" if str(held.attrs.get("time_unit")).startswith("frame") else "time_s": (
+            held["time"].to_numpy()
+        ),
     }
 
 

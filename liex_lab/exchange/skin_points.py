@@ -4,15 +4,13 @@ Each point follows the session's own body in the pose of its frame, in the arena
 Frames without a pose are NaN. `liex_lab.body.skin_points` gives the equations.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
-from liex_lab.body.skin_points import SurfacePoints
+from liex_lab.body.skin_points import place_points, points_of
 from liex_lab.errors import SessionError
 from liex_lab.runtime.memory import blocks
 from liex_lab.runtime.text_files import write_csv
@@ -20,8 +18,8 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.evidence import provenance_of, skeleton_of, track_of
 from liex_lab.sessions.rrd_scene import body_of
 from liex_lab.sessions.session import PoseArrays
-from liex_lab.tables.rows import NEAR, nearness
-from liex_lab.tables.schema import POINTS, ROWS_PER_GROUP, Block, write_table
+from liex_lab.tables.rows import NEAR, columns_of, nearness, repeated
+from liex_lab.tables.schema import POINTS, write_table
 from liex_lab.tracking.residual import BodyResidual
 
 _BLOCK = 2048  # frames whose meshes are in memory at once, about 30 MB
@@ -42,22 +40,22 @@ def derived_points(session: Session) -> PoseArrays:
             "were imported without it; export the joints"
         )
     skeleton = skeleton_of(session)
-    points = SurfacePoints.of(skeleton)
+    points = points_of(skeleton)
     track = track_of(session, skeleton)
     animal = session.metadata["animal"]
     spine_mm = animal.get("spine_mm")
     size = None if spine_mm is None else spine_mm / skeleton.length
     body = BodyResidual(*body_of(skeleton, animal), size=size)
-    xyz, sd = np.full((2, track.n_frames, len(points.names), 3), np.nan)
+    xyz, sd = np.full((2, track.n_frames, len(points), 3), np.nan)
     posed = np.flatnonzero(track.posed)
     for part in blocks(len(posed), _BLOCK):
         rows = posed[part]
         some = track[rows]
         girth = body.across(some.scale)
-        xyz[rows], sd[rows] = points.placed(body.surface, some.pose, girth, some.sd_xyz_mm)
+        xyz[rows], sd[rows] = place_points(points, body.surface, some.pose, girth, some.sd_xyz_mm)
     return replace(
         session.pose_arrays(),
-        joints=points.names,
+        joints=tuple(one.name for one in points),
         bones=(),
         xyz_mm=xyz,
         uv_px=session.camera.project(session.T_arena_camera.inverse() @ xyz),
@@ -78,39 +76,28 @@ def write_points(session: Session, path: Path) -> None:
     """
     skeleton = skeleton_of(session)
     poses = derived_points(session)
+    n, n_frames = len(poses.joints), len(poses.time_s)
+    columns = {
+        "session_id": session.name,
+        "individual": poses.individual,
+        "frame_index": np.repeat(poses.frame_index, n),
+        "time_s": np.repeat(poses.time_s, n),
+        "point": repeated(poses.joints, n_frames),
+        **columns_of(poses.xyz_mm, poses.uv_px),
+        **{f"sd_{axis}_mm": poses.sd_mm[..., k].ravel() for k, axis in enumerate("xyz")},
+        "likelihood": poses.likelihood.ravel(),
+        "derived": np.ones(n * n_frames, np.bool_),
+    }
+    about = provenance_of(session, skeleton).table_metadata() | {
+        "joints": "none: points derived from the fitted body, on its skin"
+    }
     path.mkdir()
-    about = provenance_of(session, skeleton).table_metadata()
-    about["joints"] = "none: points derived from the fitted body, on its skin"
-    write_table(path / "points.parquet", POINTS, _rows(session.name, poses), about)
-    n = len(poses.joints)
-    tracking = pd.DataFrame(
-        {
-            "video_frame": np.repeat(poses.frame_index, n),
-            "mouse_id": 1,
-            "bodypart": np.tile(SurfacePoints.of(skeleton).mabe, len(poses.frame_index)),
-            **{axis: poses.uv_px[..., k].ravel() for k, axis in enumerate("xy")},
-        }
-    )
-    write_csv(tracking, path / "mabe.csv")
-
-
-def _rows(name: str, poses: PoseArrays) -> Iterator[Block]:
-    """The table `points`, one row per frame and point, in blocks of about 100 000 rows."""
-    n = len(poses.joints)
-    likelihood = poses.likelihood
-    for part in blocks(len(poses.frame_index), ROWS_PER_GROUP // n):
-        frames = poses.frame_index[part]
-        yield {
-            "session_id": name,
-            "individual": poses.individual,
-            "frame_index": np.repeat(frames, n),
-            "time_s": np.repeat(poses.time_s[part], n),
-            "point": pa.DictionaryArray.from_arrays(
-                np.tile(np.arange(n), len(frames)), list(poses.joints)
-            ),
-            **{f"{a}_mm": poses.xyz_mm[part, :, k].ravel() for k, a in enumerate("xyz")},
-            **{f"sd_{a}_mm": poses.sd_mm[part, :, k].ravel() for k, a in enumerate("xyz")},
-            **{f"{a}_px": poses.uv_px[part, :, k].ravel() for k, a in enumerate("uv")},
-            "likelihood": likelihood[part].ravel(),
-            "derived": np.ones(n * len(frames), np.bool_),
-        }
+    write_table(path / "points.parquet", POINTS, [columns], about)
+    tracking = {
+        "video_frame": columns["frame_index"],
+        "mouse_id": 1,
+        "bodypart": np.tile([one.mabe or one.name for one in points_of(skeleton)], n_frames),
+        "x": columns["u_px"],
+        "y": columns["v_px"],
+    }
+    write_csv(pd.DataFrame(tracking), path / "mabe.csv")

@@ -21,7 +21,7 @@ from typing import Annotated, Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, SessionError, one_line, refuse
@@ -487,24 +487,15 @@ def read_document(path: Path) -> dict[str, Any]:
             if nul:
                 raise ValueError("it holds a NUL character")
     except (OSError, ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
-        why = first_error(error) if isinstance(error, ValidationError) else str(error)
         raise SessionError(
-            f"{path} is damaged and cannot be read ({(why or type(error).__name__)[:200]}); run "
-            "`liex run` on the recording again"
+            f"{path} is damaged and cannot be read ({one_line(error)}); run `liex run` on the "
+            "recording again"
         ) from None
     return found
 
 
 def _no_number(text: str) -> NoReturn:
     raise ValueError(f"it holds {text} for a number")
-
-
-def first_error(error: ValidationError) -> str:
-    """The first validation error: where, and what was expected."""
-    first = error.errors(include_url=False, include_input=False)[0]
-    where = ".".join(str(part) for part in first["loc"])
-    what = first["msg"].removeprefix("Value error, ").replace("Input should", "should")
-    return ascii(f"{where} {what}".strip())[1:-1]
 
 
 # Error translation for reading files of a session: every error becomes one sentence.

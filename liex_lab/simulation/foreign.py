@@ -175,9 +175,12 @@ class ForeignRecording(Recording):
     def _sensed(self, index: int) -> Depth:
         """Depth (H, W) mm of a frame: the scene as the sensor reads it."""
         still, rng = self._scene.still, np.random.default_rng([*self._seed, index])
-        T = self._scene.T_arena_camera.inverse()
-        vertices = T @ self._skinned(self._turned[index], self._nodes[index])
-        body = render_mesh(vertices, self._faces, self.camera)
+        body = render_mesh(
+            self._skinned(self._turned[index], self._nodes[index]),
+            self._faces,
+            self.camera,
+            T_camera_mesh=self._scene.T_arena_camera.inverse(),
+        )
         animal = (body > 0) & ((still == 0) | (body < still))
         ideal = np.where(animal, body, still)
         near, far = minimum_filter(ideal, 3), maximum_filter(ideal, 3)
@@ -191,8 +194,8 @@ class ForeignRecording(Recording):
         )
         depth = np.where(edge & (chance < 0.35), near + (far - near) * chance / 0.35, depth)
         depth = np.where(edge & animal & (chance > 1.0 - self._fur), far, depth)
-        lost = (ideal == 0) | (np.abs(grain) > np.where(edge, 1.6, 3.7))
-        depth = np.where(lost, 0.0, self._step_mm * np.round(depth / self._step_mm))
+        depth = self._step_mm * np.round(depth / self._step_mm)
+        depth[(ideal == 0) | (np.abs(grain) > np.where(edge, 1.6, 3.7))] = 0.0
         return depth.astype(np.float32)
 
     @cached_property

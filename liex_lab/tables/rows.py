@@ -151,11 +151,8 @@ class Rows:
         return {
             **self._keys,
             **self._when(part, n_joints),
-            "joint": pa.DictionaryArray.from_arrays(
-                np.tile(np.arange(n_joints), track.n_frames), list(track.skeleton.names)
-            ),
-            **{f"{axis}_mm": track.joints_mm[:, :, k].ravel() for k, axis in enumerate("xyz")},
-            **{f"{axis}_px": track.uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
+            "joint": repeated(track.skeleton.names, track.n_frames),
+            **columns_of(track.joints_mm, track.uv_px),
             "score": nearness(
                 np.sqrt((track.sd_xyz_mm**2).mean(axis=-1)), NEAR * track.spine_mm[:, None]
             ).ravel(),
@@ -179,9 +176,7 @@ class Rows:
         return {
             **self._keys,
             **self._when(part, n_rows),
-            "joint": pa.DictionaryArray.from_arrays(
-                np.tile(np.arange(n_rows), len(turn)), ["root", *track.skeleton.names]
-            ),
+            "joint": repeated(["root", *track.skeleton.names], len(turn)),
             **_xyz("w{}_rad", turn),
             **_xyz("sd_w{}_rad", spread),
             **_xyz("t{}_mm", shift),
@@ -288,6 +283,19 @@ class Rows:
     def _parts(self, rows_per_frame: int) -> Iterator[slice]:
         """Blocks of frames with about 100 000 rows."""
         return blocks(max(self.track.n_frames, 1), max(1, ROWS_PER_GROUP // rows_per_frame))
+
+
+def repeated(names: Sequence[str], n_frames: int) -> pa.DictionaryArray:
+    """The column of names of a table with one row per frame and joint."""
+    return pa.DictionaryArray.from_arrays(np.tile(np.arange(len(names)), n_frames), list(names))
+
+
+def columns_of(xyz_mm: Array, uv_px: Array) -> Block:
+    """Columns x_mm ... v_px, one row per frame and joint, of positions (n, J, 3) and (n, J, 2)."""
+    return {
+        **_xyz("{}_mm", xyz_mm),
+        **{f"{axis}_px": uv_px[:, :, k].ravel() for k, axis in enumerate("uv")},
+    }
 
 
 def _xyz(name: str, values: Array) -> dict[str, Array]:

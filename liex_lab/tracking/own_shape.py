@@ -11,8 +11,6 @@ A stated shape, as shared by the sessions of one animal, is used unchanged, and 
 with the depth of all frames that show the animal well.
 """
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -229,97 +227,3 @@ def borne_out(before: Array, after: Array) -> bool:
     fallen = before - after
     fallen = fallen[np.isfinite(fallen)]
     return bool(len(fallen)) and float(fallen.mean()) > 0.0
-
-
-# One body for the sessions of one animal: a random-effects mean of the individual estimates.
-
-
-MOST_APART = 0.08  # of the median length: a larger difference means growth, or another animal
-
-
-@dataclass(frozen=True)
-class SessionBody:
-    """The estimates of one session about its animal.
-
-    Attributes:
-        spine_mm: the animal's length, mm.
-        stated: whether the plan states that length, so that it is not an estimate.
-        log_sd: standard deviation of the logarithm of the length in single frames.
-        n_frames: frames with a pose.
-        girth: of the average body; unused if a shape was kept.
-        shape: (K,) labels of the kept shape, see `session_shape.labels_of`; None if absent.
-        refused: whether held-out frames contradicted the fitted shape.
-        n_good_frames: frames that show the animal well.
-    """
-
-    spine_mm: float
-    stated: bool = False
-    log_sd: float = 0.0
-    n_frames: int = 1
-    girth: float = 1.0
-    shape: Array | None = None
-    refused: bool = False
-    n_good_frames: int = 0
-
-
-@dataclass(frozen=True)
-class AgreedBody:
-    """The shared values of the sessions of one animal.
-
-    Attributes:
-        spine_mm: the length, mm; None if every session's plan states its own.
-        girth: of the average body; None if a shape is shared.
-        shape: (K,) labels of the shape; None if too few sessions support one.
-    """
-
-    spine_mm: float | None
-    girth: float | None
-    shape: Array | None
-
-
-def spread_of(found: Sequence[SessionBody]) -> float:
-    """The spread of the lengths: largest minus smallest, over the median.
-
-    Args:
-        found: of sessions of one animal, at least one.
-    """
-    lengths = [one.spine_mm for one in found]
-    return (max(lengths) - min(lengths)) / float(np.median(lengths))
-
-
-def agree(found: Sequence[SessionBody]) -> AgreedBody:
-    """The shared values of sessions, independent of their order.
-
-    Args:
-        found: of sessions of one animal whose lengths are at most `MOST_APART` apart.
-    """
-    kept = [(one.shape, float(one.n_good_frames)) for one in found if one.shape is not None]
-    shape = girth = None
-    if sum(n for _, n in kept) > sum(one.n_good_frames for one in found if one.refused):
-        columns = zip(*(labels.tolist() for labels, _ in kept), strict=True)
-        shape = np.array([_mean(column, [n for _, n in kept]) for column in columns])
-    average = [one for one in found if one.shape is None]
-    if shape is None and average:
-        girth = _mean([one.girth for one in average], [float(one.n_frames) for one in average])
-    measured = [one for one in found if not one.stated]
-    return AgreedBody(_length(measured) if measured else None, girth, shape)
-
-
-def _length(measured: Sequence[SessionBody]) -> float:
-    """The random-effects mean of the lengths; their logarithms have a variance from the scatter of
-    each session's own frames, and one between sessions, by the method of moments.
-    """
-    y = [math.log(one.spine_mm) for one in measured]
-    own = [max(one.log_sd**2 / max(one.n_frames, 1), 0.001**2) for one in measured]
-    between = 0.0
-    if len(y) > 1:
-        v = [1.0 / variance for variance in own]
-        m = _mean(y, v)
-        q = math.fsum(v_i * (y_i - m) ** 2 for y_i, v_i in zip(y, v, strict=True))
-        whole = math.fsum(v)
-        between = max(0.0, (q - (len(y) - 1)) / (whole - math.fsum(v_i**2 for v_i in v) / whole))
-    return math.exp(_mean(y, [1.0 / (variance + between) for variance in own]))
-
-
-def _mean(values: Sequence[float], weights: Sequence[float]) -> float:
-    return math.fsum(w * x for w, x in zip(weights, values, strict=True)) / math.fsum(weights)

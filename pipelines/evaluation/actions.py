@@ -455,8 +455,11 @@ def evaluate_tracks(
     """
     table = PointNames.load(names)
     ours = table.words or _WORDS
-    files = [path for path in sorted(Path(folder).glob("*")) if path.suffix in READERS]
-    pairs = [_people(path, table) for path in files if not path.name.endswith(".labels.csv")]
+    pairs = [
+        _people(path, table)
+        for path in sorted(Path(folder).glob("*"))
+        if path.suffix in READERS and not path.name.endswith(".labels.csv")
+    ]
     people = [one for one, _ in pairs]
     animals = sorted({one.animal for one in people})
     words = [word for word in dict.fromkeys(ours.values()) if any(word in p.words for p in people)]
@@ -466,10 +469,11 @@ def evaluate_tracks(
             f"{folder} has {len(people)} of {len(animals)} with {', '.join(words) or 'no word'}; "
             "state animals and words in the table of names (--names)"
         )
-    bundled = storage.load_action_model("mouse")
     found = {
         "rules": [_named(one, ours) for one in people],
-        "bundled": [_named(one, ours, bundled) for one in people],
+        "bundled": [
+            *map(partial(_named, ours=ours, model=storage.load_action_model("mouse")), people)
+        ],
         "taught": _taught(people, words, progress),
         "taught_without_z": _taught([flat for _, flat in pairs], words, progress),
     }
@@ -477,18 +481,20 @@ def evaluate_tracks(
         name: [_counted(one, other, words) for one, other in zip(people, named, strict=True)]
         for name, named in found.items()
     }
-    of_animal = {
-        animal: [k for k, one in enumerate(people) if one.animal == animal] for animal in animals
-    }
     score = partial(_scored, rearing=words.index(ours["rear"]))
     n_all = {"n_recordings": len(people), "n_animals": len(animals)}
     return {
         **score({name: np.stack([c.sum(axis=0) for c in of]) for name, of in counts.items()}),
         "per_animal": {
             animal: score(
-                {name: np.concatenate([of[k] for k in rows]) for name, of in counts.items()}
+                {
+                    name: np.concatenate(
+                        [n for n, one in zip(of, people, strict=True) if one.animal == animal]
+                    )
+                    for name, of in counts.items()
+                }
             )
-            for animal, rows in of_animal.items()
+            for animal in animals
         },
         "words": words,
         **n_all,
@@ -500,19 +506,22 @@ def _people(path: Path, table: PointNames) -> tuple[LabelledTrack, LabelledTrack
     """The track of a file with people's words, and the same one without heights."""
     skeleton, plan = Skeleton.load("mouse"), Plan.load("mouse")
     points = read_points(path, table)
-    mapped = table.of_joints(skeleton.names, points.names)
     words = points.words
     if words is None:
-        beside = [path.with_suffix(end) for end in (".labels.csv", ".boris")]
-        labels = next((one for one in beside if one.is_file()), beside[0])
-        words = words_of(read_any_labels(labels), points.time_s)
+        boris, labels = path.with_suffix(".boris"), path.with_suffix(".labels.csv")
+        words = words_of(read_any_labels(boris if boris.is_file() else labels), points.time_s)
     if len(words) != len(points.time_s):
         raise LiexError(
             f"{path} has {len(points.time_s)} frames and {len(words)} labels; each frame needs one"
         )
-    level = replace(points, points_mm=points.points_mm * [1.0, 1.0, 0.0])
     track, other = (
-        track_of_points(some, skeleton, mapped, plan.tracking.bridge_s) for some in (points, level)
+        track_of_points(
+            replace(points, points_mm=points.points_mm * [1.0, 1.0, height]),
+            skeleton,
+            table.of_joints(skeleton.names, points.names),
+            plan.tracking.bridge_s,
+        )
+        for height in (1.0, 0.0)
     )
     check_track(track, plan)
     one = LabelledTrack(
@@ -556,10 +565,12 @@ def _taught(
 def _counted(one: LabelledTrack, found: NDArray[np.str_], words: Sequence[str]) -> Array:
     """Frames (minutes, K, 3) hit, found and true of each word, of those with a person's word."""
     minute = (one.track.times_ns // 60_000_000_000).astype(int)
-    labelled = one.words != ethogram.UNLABELLED
     return np.array(
         [
-            [np.bincount(minute, mask) for mask in (hit & true, hit & labelled, true)]
+            [
+                np.bincount(minute, mask)
+                for mask in (hit & true, hit & (one.words != ethogram.UNLABELLED), true)
+            ]
             for hit, true in ((found == word, one.words == word) for word in words)
         ],
         float,

@@ -50,6 +50,7 @@ FOREIGN_PROTOCOL = (
     "length (others). found: share of frames with a pose. summary: median over bodies, and with 95 "
     "its 95 % interval, bodies drawn with replacement."
 )
+_NO_RECORDINGS = (".npz", ".liex", ".json", ".toml", ".csv", ".md", ".txt")
 Foreign = tuple[Recording, TrueAnimal]  # with joints as of `truth_of`
 
 
@@ -113,14 +114,17 @@ def evaluate_foreign(
         with recording:
             individuals, messages, exit_code = run_product(recording, plan)
         one = max(individuals, key=lambda one: int(one.trusted.sum()), default=None)
-        figures = body_figures(body, one, skeleton) if one else {"found": 0.0, "trusted": 0.0}
         skipped += [] if one else [f"{recording.name}: {'; '.join(messages)}"]
-        rows[recording.name] = figures | {"said": messages, "exit_code": exit_code}
+        rows[recording.name] = {
+            **(body_figures(body, one, skeleton) if one else {"found": 0.0, "trusted": 0.0}),
+            "said": messages,
+            "exit_code": exit_code,
+        }
     summary: dict[str, Any] = {"n_bodies": len(rows)}
     for name in dict.fromkeys(k for row in rows.values() for k in row if isinstance(row[k], float)):
         values = np.array([row.get(name, np.nan) for row in rows.values()])
-        bounds = interval95(values, np.arange(len(values)))
-        summary |= {name: float(np.nanmedian(values)), f"{name}95": bounds}
+        summary[name] = float(np.nanmedian(values))
+        summary[f"{name}95"] = interval95(values, np.arange(len(values)))
     return {
         "animal": animal,
         "split": "foreign",
@@ -134,10 +138,9 @@ def evaluate_foreign(
 
 def own_cases(animal: str, n_frames: int, sealed: bool, shares: Array) -> list[Foreign]:
     """The project's own foreign bodies, each in its recording; `shares` as in `truth_of`."""
-    first = SEALED_BODY if sealed else 0
     cases: list[Foreign] = []
-    for body in range(first, first + KINDS[animal]["n_bodies"]):
-        recording = ForeignRecording(animal, body, FOREIGN_SEEDS[sealed], n_frames)
+    for body in np.arange(KINDS[animal]["n_bodies"]) + SEALED_BODY * sealed:
+        recording = ForeignRecording(animal, int(body), FOREIGN_SEEDS[sealed], n_frames)
         name = f"{recording.name} {n_frames}"  # determines the content, which need not be hashed
         recording.files.known_digest = hashlib.sha256(name.encode()).hexdigest()
         cases.append((recording, truth_of(recording.truth, recording.name, recording, shares)))
@@ -163,9 +166,11 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
         if name and which:
             skipped.append(f"{path.name}: one of several animals; only single ones are scored")
             continue
-        others = (".npz", ".liex", ".json", ".toml", ".csv", ".md", ".txt")
-        beside = [one for one in path.parent.glob("*") if one.name.startswith(f"{name or path}.")]
-        beside = sorted(one for one in beside if one.suffix not in others)
+        beside = sorted(
+            one
+            for one in path.parent.glob("*")
+            if one.name.startswith(f"{name or path}.") and one.suffix not in _NO_RECORDINGS
+        )
         if not beside:
             raise LiexError(
                 f"there is no recording beside {path}; give NAME_truth.npz the same NAME as its "
@@ -185,8 +190,10 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
                 f"to {high:g} mm; another animal is stated by --animal"
             )
     if not cases:
-        why = "; ".join(skipped) or "check the path"
-        raise LiexError(f"{where} has no recording with a truth file to score: {why}")
+        raise LiexError(
+            f"{where} has no recording with a truth file to score: "
+            f"{'; '.join(skipped) or 'check the path'}"
+        )
     return cases, skipped
 
 
@@ -234,10 +241,9 @@ def truth_of(
     known = np.isfinite(joints).all(axis=-1) & np.isfinite(middle)
     if not known.any():
         raise LiexError(f"{name}: no joint has finite joints, surface_mm, thickness_mm; {_FORM}")
-    steps = np.linalg.norm(np.diff(joints, axis=1), axis=-1)
-    arc = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1)], axis=1)
+    steps = np.diff(joints, axis=1, prepend=joints[:, :1])
+    arc = np.cumsum(np.linalg.norm(steps, axis=-1), axis=1)
     length = float(np.nanmedian(np.asarray(arrays.get("arc_mm", arc[:, -1]), float)))
-    visible = np.broadcast_to(np.asarray(arrays.get("visible_fraction", 1.0), float), n)
     uv = camera.project(joints[known])
     inside = ((uv > -0.5) & (uv < np.array([camera.width, camera.height]) - 0.5)).all(axis=-1)
     refuse(
@@ -259,7 +265,8 @@ def truth_of(
         ok = np.isfinite(values[i, :, k])
         at, ends = arc[i, ok] / arc[i, -1], {"left": np.nan, "right": np.nan}
         points[i, :, k] = np.interp(shares, at, values[i, ok, k], **ends)
-    return TrueAnimal(length, points, visible)
+    visible = np.asarray(arrays.get("visible_fraction", 1.0), float)
+    return TrueAnimal(length, points, np.broadcast_to(visible, n))
 
 
 def body_figures(truth: TrueAnimal, one: MeasuredIndividual, skeleton: Skeleton) -> dict[str, Any]:
@@ -296,13 +303,12 @@ def body_figures(truth: TrueAnimal, one: MeasuredIndividual, skeleton: Skeleton)
     constant = np.median(along[usual], axis=0)
     off[..., :2] -= constant[:, None] * way
     error = np.nanmean(np.linalg.norm(off, axis=-1), axis=1)
-    ours = np.linalg.norm(np.diff(joints, axis=1), axis=-1).sum(axis=1)
     inside = np.abs(off @ one.R_arena_camera.T) <= 1.645 * one.sd_mm[known]
     inside = inside[np.isfinite(off).all(axis=-1) & rows[:, None]].mean(axis=0)
-    limit_mm = 10.0 if skeleton.name == "mouse" else FAR * truth.spine_mm
-    wrong = (error > limit_mm)[one.trusted[known]]
+    ours = np.linalg.norm(np.diff(joints[rows], axis=1), axis=-1).sum(axis=1)
+    wrong = error[one.trusted[known]] > (10.0 if skeleton.name == "mouse" else FAR * truth.spine_mm)
     return figures | {
-        "size_percent": 100.0 * float(np.median(ours[rows]) / truth.spine_mm - 1.0),
+        "size_percent": 100.0 * float(np.median(ours) / truth.spine_mm - 1.0),
         "across_mm": float(np.median(across[rows].mean(axis=1))),
         "along_mm": float(np.median(np.abs(along - constant)[rows].mean(axis=1))),
         "depth_mm": float(np.median(np.nanmean(np.abs(off[rows, :, 2]), axis=1))),

@@ -16,13 +16,12 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from liex_lab.errors import MissingPackageError, StudyError, how_to_install
+from liex_lab.errors import MissingPackageError, StudyError, how_to_install, one_line
 from liex_lab.plan import plans_folder
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.processes import n_cores, worker_environment
-from liex_lab.sessions.provenance import first_error
 
 from .crew import DEATHS, Crew
 
@@ -167,9 +166,9 @@ class SlurmTable(BaseModel):
         try:
             return SlurmTable.model_validate(text_files.read_toml(file))
         except ValueError as error:
-            why = first_error(error) if isinstance(error, ValidationError) else error
             raise StudyError(
-                f"{file} should be a TOML file like the bundled slurm.toml, but: {why}; correct it"
+                f"{file} should be a TOML file like the bundled slurm.toml, but: "
+                f"{one_line(error)}; correct it"
             ) from None
 
 

@@ -13,15 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field
 
 from liex_lab.behaviour.cohort import unified
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import find_model, sha256
 from liex_lab.errors import LiexError, RecordingError
-from liex_lab.estimation.session_shape import PLACES
 from liex_lab.plan import Plan, sections
 from liex_lab.plan.study import VIRTUAL, PlannedSession, Study, find_subject, same
 from liex_lab.runtime import durable, processes
@@ -30,14 +27,13 @@ from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_descr
 from liex_lab.sessions.folder import describe_failure, read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
 from liex_lab.sessions.verdict import CAUTION, NEEDS_REVIEW, state_in_words, verdict_in
-from liex_lab.tracking.own_shape import MOST_APART, SessionBody, agree, spread_of
 
-from ..build import animal_facts, build_estimator, build_recording, open_planned, shape_labels
+from ..build import animal_facts, build_estimator, build_recording, open_planned
 from ..choice import fit_plan
 from ..session import MEASURING
+from .shared_body import MOST_APART, Inspection, agree, spread_of
 
 INSPECTING = "inspecting the animal"
-_DECIMALS = 4  # of a shape, relative to the length or to the average animal
 InspectSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
 
 
@@ -131,34 +127,6 @@ def input_stamp(recording: str) -> str:
     return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
-
-
-class _ShapeFound(_Part):
-    kept: bool = False
-    n_frames: int = Field(0, ge=0)
-    residual_mm: float | None = None
-    width: list[float] = []
-    height: list[float] = []
-    joints_moved: list[list[float]] = []
-
-
-class _AnimalFound(_Part):
-    spine_mm: sections.Positive
-    girth: sections.Factor
-    shape: _ShapeFound | None = None
-
-
-class _Inspection(_Part):
-    """The entries of look.json that are read if an animal was found."""
-
-    animal: _AnimalFound
-    log_sd: float = Field(ge=0.0)
-    n_frames: int = Field(ge=1)
-    stated: bool
-
-
 def shared_sessions(study: Study) -> list[tuple[PlannedSession, str]]:
     """The sessions of a study, in order, with size and shape shared by the stored findings.
 
@@ -214,7 +182,9 @@ def together(
     """The sessions of one animal with the shared values in their plans, or why there are none."""
     subject = group[0].animal.id
     taking_part = {
-        s.id: found_in(inspections[s.id]) for s in group if not _why_not(inspections[s.id])
+        s.id: Inspection.model_validate(inspections[s.id])
+        for s in group
+        if not _why_not(inspections[s.id])
     }
     alone = f"The sessions of {subject} do not share size and shape"
     if len(taking_part) < 2:
@@ -222,20 +192,13 @@ def together(
         return [replace(s, remark=f"{alone}: {shown_by} shows the animal.") for s in group]
     found = list(taking_part.values())
     if (spread := spread_of(found)) > MOST_APART:
-        lengths = sorted(one.spine_mm for one in found)
+        lengths = sorted(one.animal.spine_mm for one in found)
         why = (
             f"{alone}: their lengths, {lengths[0]:.1f} to {lengths[-1]:.1f} mm, lie {spread:.1%} "
             f"apart, more than {MOST_APART:.0%}; each keeps its own."
         )
         return [replace(s, remark=why) for s in group]
-    agreed = agree(found)
-    body = sections.SharedBody(
-        subject=subject,
-        n_sessions=len(found),
-        spine_mm=None if agreed.spine_mm is None else round(agreed.spine_mm, 3),
-        girth=None if agreed.girth is None else round(agreed.girth, _DECIMALS),
-        shape=None if agreed.shape is None else _shape(agreed.shape),
-    )
+    body = agree(subject, found)
     animals = {s.id: s.plan.animal.model_copy(update={"shared": body}) for s in group}
     return [
         replace(s, plan=s.plan.model_copy(update={"animal": animals[s.id]}))
@@ -254,37 +217,6 @@ def _why_not(inspection: Mapping[str, Any]) -> str:
     if "failure" in inspection:
         return str(inspection["failure"].get("reason", ""))
     return ", and ".join(map(str, inspection["misfits"]))
-
-
-def found_in(inspection: Mapping[str, Any]) -> SessionBody:
-    """The findings on an animal, from `inspect_animal` of a session that shows it.
-
-    Raises:
-        ValueError: it is damaged.
-    """
-    read = _Inspection.model_validate(inspection)
-    shape = read.animal.shape or _ShapeFound()
-    stated = shape.model_dump(include={"width", "height", "joints_moved"})
-    return SessionBody(
-        read.animal.spine_mm,
-        read.stated,
-        read.log_sd,
-        read.n_frames,
-        read.animal.girth,
-        shape_labels(sections.SharedShape.model_validate(stated)) if shape.kept else None,
-        # a shape was tried, and rejected on held-out frames
-        not shape.kept and shape.residual_mm is not None,
-        shape.n_frames,
-    )
-
-
-def _shape(labels: Any) -> sections.SharedShape:
-    p = len(PLACES)
-    return sections.SharedShape(
-        width=np.exp(labels[-2 * p : -p]).round(_DECIMALS).tolist(),
-        height=np.exp(labels[-p:]).round(_DECIMALS).tolist(),
-        joints_moved=labels[: -2 * p].reshape(-1, 3).round(_DECIMALS).tolist(),
-    )
 
 
 class MeasuringStage:
@@ -383,9 +315,10 @@ def read_inspection(session: PlannedSession) -> dict[str, Any] | None:
         if what_changed(session, inspection):
             return None
         if not _why_not(inspection) and not failed:
-            found = found_in(inspection)
+            shape = Inspection.model_validate(inspection).animal.shape
+            sizes = [len(part) for part in (shape.width, shape.height, shape.joints_moved)]
             n_joints = Skeleton.load(session.plan.animal.skeleton).n_joints
-            if found.shape is not None and len(found.shape) != 3 * n_joints + 2 * sections.N_PLACES:
+            if shape.kept and sizes != [sections.N_PLACES, sections.N_PLACES, n_joints]:
                 return None
     except (OSError, LiexError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
