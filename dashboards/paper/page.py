@@ -354,7 +354,6 @@ def exhibits(
     tables["Table 3"].append(("How each row of Tables 1 to 3 was made", origin_table(results)))
     if further["nyu"]:
         tables["Table 2"].append(("NYU hands", _nyu_table(further["nyu"])))
-        notes["Table 2"].append(further["nyu"]["labels_used"])
     else:
         notes["Table 2"].append(f"NYU: {further['missing']['nyu']}.")
     if tracking := further["tracking"]:

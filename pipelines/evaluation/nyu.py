@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError, ModelError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings.formats.images.nyu import (
-    N_FIRST_PERSON,
     PALM,
     POINTS,
     Array,
@@ -29,7 +28,6 @@ from liex_lab.recordings.formats.images.nyu import (
     points_of_joints,
 )
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.hand.simulator import OBSERVED_SHARE
 
 from ..build import build_estimator, build_recording, build_scene
 
@@ -44,11 +42,6 @@ NYU_PROTOCOL = (
 )
 _SHOWN = 10  # hands in Fig 12 of Lie-X
 _OURS = "liex_lab"
-_LABELS = (
-    "The bone lengths of our hand, and {share:.0f} % of the postures that our bundled model was "
-    "trained on, come from labels of the NYU test frames 1 to {last}, whose source states no "
-    "licence. Frames among these that ours was measured on: {n} of {of}."
-)
 _PUBLISHED = {
     "liex": "Lie-X (Xu et al. 2017), palm placed on the true palm",
     "v2v_posenet": "V2V-PoseNet (Moon et al. 2018)",
@@ -114,8 +107,8 @@ def evaluate_nyu(
 
     Returns:
         `published` by method, `ours` (with a note if there are no frames or no model),
-        `same_frames`: the published results on the frames of ours alone, `labels_used`: the use of
-        test labels in our model, `n_labelled` and the protocol.
+        `same_frames`: the published results on the frames of ours alone, `n_labelled` and the
+        protocol.
 
     Raises:
         LiexError: frames and labels do not belong together.
@@ -141,7 +134,6 @@ def evaluate_nyu(
         "published": published,
         "ours": ours,
         "same_frames": same,
-        "labels_used": labels_used(numbers),
         "protocol": NYU_PROTOCOL,
     }
 
@@ -171,16 +163,6 @@ def shown_hands(
                 if np.isfinite(answer[k]).all():
                     hand["pose"] = answer[k]
     return found or {"labels": [{"head": f"frame {k + 1}", "truth": labels.truth[k]} for k in rows]}
-
-
-def labels_used(numbers: Numbers) -> str:
-    """A sentence on test labels in our hand model, for frame numbers (n,) from 1 on."""
-    return _LABELS.format(
-        share=100 * OBSERVED_SHARE,
-        last=N_FIRST_PERSON,
-        n=int((numbers <= N_FIRST_PERSON).sum()),
-        of=len(numbers),
-    )
 
 
 def frame_numbers_in(folder: Path, n_labelled: int) -> Numbers:
@@ -215,7 +197,7 @@ def hands_in_short(result: dict[str, Any]) -> dict[str, str]:
             f"14 points: {row['root_estimated_mm_14']:.2f} mm, root given "
             f"{row['root_given_mm_14']:.2f}"
         )
-    return {**lines, "labels used": result["labels_used"], "protocol": result["protocol"]}
+    return {**lines, "protocol": result["protocol"]}
 
 
 def _ours(

@@ -20,7 +20,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import HandSegmenter, sight_rotations
 from liex_lab.scene.height_maps import HeightMaps, view_of
-from liex_lab.simulation.hand.simulator import draw_observed
+from liex_lab.simulation.hand.postures import draw_postures, draw_turns
 from tests.oracles.explain import explained
 
 HAND = Skeleton.load("hand")
@@ -34,7 +34,7 @@ SCENE = HandSegmenter(CAMERA, Floor.from_plane(np.array([0.0, 0.0, 1.0]), 900.0,
 def hands(n: int = 24, seed: int = 0) -> tuple[HeightMaps, np.ndarray, Pose]:
     """Height maps of bare hands, how they were cut, and their poses in the view frames."""
     rng = np.random.default_rng(seed)
-    angles, turns = draw_observed(rng, HAND, n)
+    angles, turns = draw_postures(rng, HAND, n), draw_turns(rng, n)
     place = np.column_stack([rng.uniform(-40, 40, (n, 2)), rng.uniform(600, 700, n)])
     pose = Pose(SE3(np.swapaxes(sight_rotations(place), 1, 2) @ turns, place), angles, np.ones(n))
     surface = Surface.of(HAND)

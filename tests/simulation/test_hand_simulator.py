@@ -86,7 +86,7 @@ def test_with_the_reference_test_postures_are_the_second_persons(
         find_reference()
     world = HandSimulator(HAND, reference_data / "hand_nyu")
     assert f"from {N_FIRST_PERSON + 1} on" in world.protocol
-    assert "statistics" in HandSimulator(HAND).protocol
+    assert "anatomy" in HandSimulator(HAND).protocol
     session = world.test_split("clean", n_sessions=1)[0]
     truth = NyuReference.load(reference_data / "hand_nyu").truth[N_FIRST_PERSON:]
     mine = session.joints_camera - session.joints_camera[:, :1]
