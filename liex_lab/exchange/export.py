@@ -61,7 +61,7 @@ TARGETS: dict[str, tuple[str, str, str]] = {
     "points": (
         "skin_points.write_points",
         "_points",
-        "a folder with points on the skin, derived from the fitted body: points.parquet, mabe.csv",
+        "a folder with points on the skin, derived from the fitted body, and the tail's direction",
     ),
     "csv": (
         "export.write_csv_folder",

@@ -12,6 +12,7 @@ import pandas as pd
 
 from liex_lab.body.skin_points import place_points, points_of
 from liex_lab.errors import SessionError
+from liex_lab.exchange.tail import TAIL, find_tail
 from liex_lab.runtime.memory import blocks
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
@@ -74,30 +75,41 @@ def write_points(session: Session, path: Path) -> None:
     Raises:
         LiexError: no points are stated for this animal.
     """
-    skeleton = skeleton_of(session)
-    poses = derived_points(session)
-    n, n_frames = len(poses.joints), len(poses.time_s)
+    skeleton, poses = skeleton_of(session), derived_points(session)
+    names, n_frames = [*poses.joints], len(poses.time_s)
+    xyz, sd, likelihood = poses.xyz_mm, poses.sd_mm, poses.likelihood
+    angles = np.full((2, *likelihood.shape), np.nan)
+    if "tail_base" in names and "tail_mm" in skeleton.surface:
+        base = names.index("tail_base")
+        heading = track_of(session, skeleton).root_rotation[:, :2, 0]
+        tail = find_tail(session, xyz[:, base], sd[:, base], heading)
+        xyz, sd = np.insert([xyz, sd], len(names), tail[:2], axis=2)
+        likelihood = np.column_stack([likelihood, tail.probability])
+        angles = np.insert(angles, len(names), tail[3:], axis=2)
+        names.append(TAIL)
     columns = {
         "session_id": session.name,
         "individual": poses.individual,
-        "frame_index": np.repeat(poses.frame_index, n),
-        "time_s": np.repeat(poses.time_s, n),
-        "point": repeated(poses.joints, n_frames),
-        **columns_of(poses.xyz_mm, poses.uv_px),
-        **{f"sd_{axis}_mm": poses.sd_mm[..., k].ravel() for k, axis in enumerate("xyz")},
-        "likelihood": poses.likelihood.ravel(),
-        "derived": np.ones(n * n_frames, np.bool_),
+        "frame_index": np.repeat(poses.frame_index, len(names)),
+        "time_s": np.repeat(poses.time_s, len(names)),
+        "point": repeated(names, n_frames),
+        **columns_of(xyz, session.camera.project(session.T_arena_camera.inverse() @ xyz)),
+        **{f"sd_{axis}_mm": sd[..., k].ravel() for k, axis in enumerate("xyz")},
+        "turn_rad": angles[0].ravel(),
+        "lift_rad": angles[1].ravel(),
+        "likelihood": likelihood.ravel(),
+        "derived": np.tile(np.array(names) != TAIL, n_frames),
     }
     about = provenance_of(session, skeleton).table_metadata() | {
         "joints": "none: points derived from the fitted body, on its skin"
     }
     path.mkdir()
     write_table(path / "points.parquet", POINTS, [columns], about)
+    mabe = [one.mabe or one.name for one in points_of(skeleton)]
     tracking = {
-        "video_frame": columns["frame_index"],
+        "video_frame": np.repeat(poses.frame_index, len(mabe)),
         "mouse_id": 1,
-        "bodypart": np.tile([one.mabe or one.name for one in points_of(skeleton)], n_frames),
-        "x": columns["u_px"],
-        "y": columns["v_px"],
+        "bodypart": np.tile(mabe, n_frames),
+        **{axis: poses.uv_px[..., k].ravel() for k, axis in enumerate("xy")},
     }
     write_csv(pd.DataFrame(tracking), path / "mabe.csv")

@@ -10,6 +10,7 @@ of 15 % of the spine all around:
 
     box = hull(joints, centroid -+ 0.7 sqrt(n_px)) -+ (0.15 spine f / z + 4 px).
 
+A body with a tail has a further point, 0.35 of the spine straight behind its rump.
 It depends on the single frame only, so it is the same in every process.
 
 Rerun's viewer reports images of changing size as a broken video. In its replay, cut-outs therefore
@@ -29,7 +30,7 @@ from typing import Any
 import cv2
 import numpy as np
 import zstandard
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.errors import RecordingError, SessionError
 from liex_lab.optics.camera import Camera
@@ -57,6 +58,7 @@ _FRAMES = 16  # from which the background is learned
 _REACH = 0.7  # of the square root of an object's pixels, to each side of its centroid
 _MARGIN = 0.15  # of the spine
 _MARGIN_PX = 4.0
+_TAIL = 0.35  # of the spine, straight behind a body with a tail
 _SIDES = (1.0, 1.15, 1.4)  # of windows, in lengths of the animal's box on the floor
 N_WINDOWS = len(_SIDES) ** 2 + 1  # at most; the last is the whole image
 
@@ -246,6 +248,10 @@ def boxes_around(observations: Observations, origin: Provenance) -> Boxes:
         joints = observations.joints_as(h, range(observations.skeleton.n_joints))[rows].astype(
             np.float64
         )
+        if "tail_mm" in origin.skeleton.surface:
+            tail = joints[:, :1] - joints[:, 1:2]
+            tail *= _TAIL * spine_mm / np.maximum(np.linalg.norm(tail, axis=2, keepdims=True), 1e-9)
+            joints = np.append(joints, joints[:, :1] + tail, axis=1)
         centre = observations.centroid_px[rows, h].astype(np.float64)
         reach = _REACH * np.sqrt(observations.n_px[rows, h].astype(np.float64))[:, None]
         far = (into @ observations.centroid_mm[rows, h].astype(np.float64))[:, 2:]
@@ -341,20 +347,22 @@ class Kept:
                     raise ValueError(f"boxes are {boxes.shape}, not those of every frame")
                 self.boxes = boxes
 
-    def holds(self, row: int, u_px: float, v_px: float) -> bool:
-        """Whether a pixel of a frame was kept as read.
+    def holds(self, row: int, u_px: ArrayLike, v_px: ArrayLike) -> NDArray[np.bool_]:
+        """Whether pixels of a frame were kept as read.
 
         Args:
             row: the frame's row in the table `frames`.
-            u_px: column, px; rounded.
-            v_px: row of the image, px; rounded.
+            u_px: columns, px; rounded.
+            v_px: rows of the image, px; rounded.
+
+        Returns:
+            Booleans in the shape of `u_px`.
         """
+        u, v = (np.rint(np.asarray(px, float))[..., None] for px in (u_px, v_px))
         if self.boxes is None:  # whole images, as in sessions of earlier versions
-            return True
+            return np.ones(u.shape[:-1], np.bool_)
         left, top, right, bottom = self.boxes[row].T
-        u = round(u_px)
-        v = round(v_px)
-        return bool(((left <= u) & (u < right) & (top <= v) & (v < bottom)).any())
+        return np.asarray(((left <= u) & (u < right) & (top <= v) & (v < bottom)).any(axis=-1))
 
 
 def needed_bytes(
