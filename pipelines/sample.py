@@ -13,7 +13,9 @@ import numpy as np
 
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import mcap, provenance
-from liex_lab.simulation import locomotion, recording, species
+from liex_lab.simulation.recording import RenderedRecording
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.species import MouseSpecies
 
 SEED = 341  # a walk in which the animal turns, crosses its arena and rears once
 SPINE_MM = 65.0
@@ -58,14 +60,14 @@ def write_sample(path: str | Path, *, progress: Progress = silent) -> Path:
     return path
 
 
-def virtual_mouse() -> recording.SyntheticSession:
+def virtual_mouse() -> RenderedRecording:
     """The animal of the sample, with arena, camera and the exact truth of every frame."""
-    return locomotion.walking_session(
-        SEED, N_FRAMES, sensor=species.PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk"
+    return MouseSpecies().motion(
+        SEED, N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM, name="mouse_walk"
     )
 
 
-def _card(path: Path, mouse: recording.SyntheticSession) -> str:
+def _card(path: Path, mouse: RenderedRecording) -> str:
     """The sample's card, TOML."""
     facts = {
         "what": (

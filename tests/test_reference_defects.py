@@ -23,7 +23,7 @@ from liex_lab.recordings import open_recording
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.height_maps import Patches
 from liex_lab.scene.learning import learn_scene
-from liex_lab.simulation.species import BY_NAME
+from liex_lab.simulation.sensors import BY_NAME
 from tests.behaviour.test_kinematics import tables_of
 from tests.oracles.plate import Plate
 from tests.recordings.writers import depth_frames, even_times, write_moseq_folder, write_png_folder

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.evaluation.scores import Array, Followed, MeasuredIndividual
 from liex_lab.recordings.formats.images.nyu import POINTS
-from liex_lab.simulation.recording import TrueAnimal, TrueRecording
-from liex_lab.simulation.simulator import TestSequence
+from liex_lab.simulation.recording import RenderedRecording, TrueAnimal
 
 Results = Sequence[Mapping[str, Any]]
 
@@ -370,7 +369,7 @@ def draw_convergence(shown: Mapping[str, Any], path: Path) -> Path:
     return _save(figure, path)
 
 
-def draw_tracking(sequence: TestSequence, rows: Mapping[str, Followed], path: Path) -> Path:
+def draw_tracking(sequence: RenderedRecording, rows: Mapping[str, Followed], path: Path) -> Path:
     """Fig. 18: tracking error over time compared with single frames, and the worst moments.
 
     Args:
@@ -411,7 +410,9 @@ def worst_moments(error: Array) -> list[int]:
     return sorted(chosen)
 
 
-def _moment(panel: Axes, sequence: TestSequence, rows: Mapping[str, Followed], frame: int) -> None:
+def _moment(
+    panel: Axes, sequence: RenderedRecording, rows: Mapping[str, Followed], frame: int
+) -> None:
     """The depth around the animal with the true and the estimated skeletons."""
     spine, camera = sequence.spine_mm, sequence.camera
     middle = sequence.joints_camera[frame].mean(axis=0)
@@ -512,7 +513,7 @@ def draw_confusions(result: Mapping[str, Any], path: Path) -> Path:
 
 def draw_scene(
     name: str,
-    recording: TrueRecording,
+    recording: RenderedRecording,
     truths: Sequence[TrueAnimal],
     individuals: Sequence[MeasuredIndividual],
     folder: Path,

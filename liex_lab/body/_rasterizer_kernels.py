@@ -64,14 +64,6 @@ def draw_projected(projected, faces, u0, v0, inverse):
 
 
 @kernel()
-def draw(vertices, faces, rotation, translation, intrinsics, u0, v0, inverse):
-    """Draw the triangles of a mesh, see `project` and `draw_projected`."""
-    projected = np.empty((vertices.shape[0], 3))
-    project(vertices, rotation, translation, intrinsics, projected)
-    draw_projected(projected, faces, u0, v0, inverse)
-
-
-@kernel()
 def _draw_triangle(p, a, b, c, inverse):
     """Draw the triangle of rows a, b, c of `p` (V, 3): pixel column, pixel row, 1 / z."""
     if p[a, 2] <= 0.0 or p[b, 2] <= 0.0 or p[c, 2] <= 0.0:
@@ -112,20 +104,6 @@ def _draw_triangle(p, a, b, c, inverse):
             wc += wc_u
 
 
-@kernel()
-def to_depth(inverse, depth):
-    """Depth from inverse depth; 0 for empty pixels.
-
-    Args:
-        inverse: (H, W) 1/mm.
-        depth: (H, W) mm, out.
-    """
-    for row in range(inverse.shape[0]):
-        for column in range(inverse.shape[1]):
-            value = inverse[row, column]
-            depth[row, column] = 1.0 / value if value > 0.0 else 0.0
-
-
 @kernel(nogil=True)
 def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth, start, stop):
     """Depth images of n meshes; see `draw_projected`.
@@ -142,16 +120,12 @@ def draw_batch(vertices, faces, rotation, translation, intrinsics, origin, depth
         stop: the item after the last.
     """
     inverse = np.empty(depth.shape[1:])
+    projected = np.empty((vertices.shape[1], 3))
     for i in range(start, stop):
         inverse[:] = 0.0
-        draw(
-            vertices[i],
-            faces,
-            rotation[i],
-            translation[i],
-            intrinsics[i],
-            origin[i, 0],
-            origin[i, 1],
-            inverse,
-        )
-        to_depth(inverse, depth[i])
+        project(vertices[i], rotation[i], translation[i], intrinsics[i], projected)
+        draw_projected(projected, faces, origin[i, 0], origin[i, 1], inverse)
+        for row in range(inverse.shape[0]):
+            for column in range(inverse.shape[1]):
+                value = inverse[row, column]
+                depth[i, row, column] = 1.0 / value if value > 0.0 else 0.0

@@ -7,6 +7,7 @@ feet are ellipsoids, the tail is a thin tube. `Spheres` approximates any body al
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -697,23 +698,9 @@ def render_mesh(
         (H, W) float32 mm, 0 outside the mesh.
     """
     T = SE3.identity() if T_camera_mesh is None else T_camera_mesh
-    u0, v0, width, height = (0, 0, camera.width, camera.height) if window is None else window
-    check_shapes("a mesh", ("vertices", vertices, ("V", 3)), ("faces", faces, ("F", 3)))
-    check_index("vertices", faces, len(vertices))
-    inverse = np.zeros((height, width))
-    depth = np.empty((height, width), np.float32)
-    rasterizer_kernels.draw(
-        np.ascontiguousarray(vertices),
-        faces,
-        T.rotation,
-        T.translation,
-        camera.intrinsics,
-        float(u0),
-        float(v0),
-        inverse,
-    )
-    rasterizer_kernels.to_depth(inverse, depth)
-    return depth
+    u0, v0, *size = (0, 0, camera.width, camera.height) if window is None else window
+    vertices, intrinsics = np.asarray(vertices)[None], camera.intrinsics[None]
+    return render_meshes(vertices, faces, T[None], intrinsics, np.array([[u0, v0]]), size)[0]
 
 
 def render_meshes(
@@ -722,7 +709,7 @@ def render_meshes(
     T_camera_mesh: SE3,
     intrinsics: Array,
     origin: Array,
-    size: tuple[int, int],
+    size: Sequence[int],
 ) -> NDArray[np.float32]:
     """Depth images of many meshes, each by its own camera in its own window.
 
@@ -751,10 +738,10 @@ def render_meshes(
     in_parallel(
         rasterizer_kernels.draw_batch,
         n,
-        vertices,
+        np.ascontiguousarray(vertices, float),
         faces,
-        T_camera_mesh.rotation,
-        T_camera_mesh.translation,
+        np.ascontiguousarray(T_camera_mesh.rotation),
+        np.ascontiguousarray(T_camera_mesh.translation),
         np.asarray(intrinsics, float),
         np.asarray(origin, float),
         depth,

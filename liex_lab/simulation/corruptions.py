@@ -4,30 +4,19 @@ A script deals shuffled decks of the events in `EVENTS`, so that each kind recur
 readings (holes), a bar across the line of sight (occluder), a second object (object), an animal
 that disappears in the floor's noise or in glare (faint), stretches at two to three times the speed
 (fast), and missing frames (dropped). Objects are rendered with the scene; `Loss` is applied to the
-finished depth images; `visible_share` measures how much of the animal an occluder leaves visible.
+finished depth images.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body._skinning_kernels import joined_faces
 from liex_lab.optics.camera import Camera
-from liex_lab.simulation.scene import (
-    N_PARTS,
-    OBJECT_FACES,
-    SPHERE_TUBE,
-    SimulatedScene,
-    draw_object,
-    mesh_of,
-)
+from liex_lab.simulation.rendering import Solid
+from liex_lab.simulation.scene import OBJECT_FACES, SimulatedScene, draw_object, mesh_of
 
 Array = NDArray[np.float64]
-Beside = Callable[
-    [np.random.Generator, Array, float], Array
-]  # a second object from joints (n, J, 3) and a length
 
 # kind: (share of the events, shortest and longest in s)
 EVENTS = {
@@ -39,8 +28,6 @@ EVENTS = {
     "dropped": (3, 0.1, 0.35),
 }
 _CELL = 3  # side of the cells of dropout, px
-
-TWO_FACES = joined_faces([SPHERE_TUBE] * (2 * N_PARTS))
 
 
 @dataclass(frozen=True)
@@ -119,37 +106,36 @@ def pace(rng: np.random.Generator, events: list[Event], n_frames: int) -> NDArra
 def draw_objects(
     rng: np.random.Generator,
     events: list[Event],
-    eye: Array,
+    scene: SimulatedScene,
     joints: Array,
     length_mm: float,
-    beside: Beside,
-    floats: bool = True,
-) -> Array:
-    """Meshes of the occluder and of a second object in each frame; far behind the camera if absent.
+    kinds: tuple[str, ...],
+    floats: bool,
+) -> tuple[Solid, ...]:
+    """The occluder and a second object.
 
     Args:
         rng: random number generator.
         events: the script; only 'occluder' and 'object' are used.
-        eye: (3,) position of the camera, mm, arena frame.
+        scene: the still scene and its camera.
         joints: (n, J, 3) of the animal, mm, arena frame.
         length_mm: of the animal, mm.
-        beside: makes the second object from a generator, joints and a length.
+        kinds: kinds of second objects, see `scene.draw_object`.
         floats: the animal is above the floor, so that the occluder passes at 0.65 of the camera's
             height; else at up to three body lengths.
-
-    Returns:
-        (n, 2 V, 3) mm, arena frame: the occluder's vertices, then the second object's.
     """
-    one = int(OBJECT_FACES.max()) + 1
-    # behind the camera
-    objects = np.tile(eye + np.array([0.0, 0.0, 1e6]), (len(joints), 2 * one, 1))
+    eye = scene.T_arena_camera.translation
+    mesh = np.zeros((2, len(joints), int(OBJECT_FACES.max()) + 1, 3))
+    shown = np.zeros((2, len(joints)), np.bool_)
     for event in events:
         span = slice(event.start, event.stop)
         if event.kind == "occluder":
-            objects[span, :one] = _passing(rng, eye, joints[span], length_mm, floats)
+            mesh[0, span] = _passing(rng, eye, joints[span], length_mm, floats)
+            shown[0, span] = True
         elif event.kind == "object":
-            objects[span, one:] = beside(rng, joints[span], length_mm)
-    return objects
+            mesh[1, span] = beside(rng, scene, joints[span], length_mm, kinds)
+            shown[1, span] = True
+    return tuple(Solid.of(mesh[k], OBJECT_FACES, shown[k]) for k in range(2))
 
 
 def _passing(
@@ -171,14 +157,14 @@ def _passing(
     return mesh + place[:, None]
 
 
-def beside_animal(
+def beside(
     rng: np.random.Generator,
     scene: SimulatedScene,
     joints: Array,
     length_mm: float,
     kinds: tuple[str, ...],
 ) -> Array:
-    """A stationary object near the animal's path, close to it if there is space.
+    """A stationary object (V, 3) mm near the animal's path, close to it if there is space.
 
     Of 60 random positions, the one whose gap to the path is nearest to half a body length is used,
     with penalties for overlapping the walls or the path.
@@ -189,9 +175,6 @@ def beside_animal(
         joints: (n, J, 3) of the animal during the event, mm, arena frame.
         length_mm: of the animal, mm.
         kinds: kinds of objects to choose from, see `scene.draw_object`.
-
-    Returns:
-        (n, V, 3) mm, arena frame, the same in every frame.
     """
     mesh = draw_object(rng, str(rng.choice(kinds)), length_mm)
     path = joints[..., :2].reshape(-1, 2)
@@ -207,32 +190,9 @@ def beside_animal(
         for _ in range(60)
     ]
     best = min(places, key=cost)
-    return np.broadcast_to(mesh + np.array([*best, 0.0]), (len(joints), *mesh.shape))
-
-
-def beside_hand(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
-    """A stationary block or ball next to a hand, at about its depth.
-
-    Args:
-        rng: random number generator.
-        joints: (n, J, 3) of the hand during the event, mm, arena frame.
-        length_mm: of the hand, mm.
-
-    Returns:
-        (n, V, 3) mm, arena frame, the same in every frame.
-    """
-    # half sides over the hand's length
-    radii = rng.uniform(0.08, 0.3, 3) * length_mm
-    power = rng.choice([2.0, 8.0])
-    mesh = mesh_of([(np.zeros(3), radii, rng.uniform(-np.pi, np.pi), power)])
-    direction = rng.uniform(-np.pi, np.pi)
-    toward = np.array([np.cos(direction), np.sin(direction)])
-    reach = (joints[..., :2] @ toward).max() + np.hypot(*radii[:2])
-    # distance over the hand's length
-    reach += rng.uniform(0.1, 0.5) * length_mm
-    middle = joints.mean(axis=(0, 1))
-    place = np.array([*(middle[:2] + (reach - middle[:2] @ toward) * toward), middle[2]])
-    return np.broadcast_to(mesh + place, (len(joints), *mesh.shape))
+    floor = scene.still.size > 0  # without one it is at the animal's depth
+    lift = 0.0 if floor else joints[..., 2].mean() - mesh[:, 2].max() / 2.0
+    return np.asarray(mesh + np.array([*best, lift]))
 
 
 @dataclass(frozen=True)
@@ -328,33 +288,6 @@ class Loss:
                 depth[gone & near] = 0.0
             for u0, v0, radius in self.discs[i]:
                 depth[np.hypot(u - u0, v - v0) < radius] = 0.0
-
-
-def visible_share(
-    vertices: Array, objects: Array, camera: Camera, rows: NDArray[np.int64]
-) -> Array:
-    """Share of the animal's vertices that are not occluded, 1 in frames other than `rows`.
-
-    A vertex counts as occluded if it projects into the convex hull of the occluder's projection, as
-    the occluder is nearer.
-
-    Args:
-        vertices: (n, V, 3) of the animal, mm, camera frame.
-        objects: (n, W, 3) of the occluder, mm, camera frame.
-        camera: the camera.
-        rows: frames with an occluder.
-
-    Returns:
-        (n,) from 0 to 1.
-    """
-    from scipy.spatial import Delaunay
-
-    share = np.ones(len(vertices))
-    for i in rows:
-        shadow = camera.project(objects[i])
-        animal = camera.project(vertices[i])
-        share[i] = 1.0 - float((Delaunay(shadow).find_simplex(animal) >= 0).mean())
-    return share
 
 
 def hidden_spans(share: Array) -> list[Event]:

@@ -9,7 +9,6 @@ while it scoots, glides, turns, rises, dives and rests.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,25 +22,13 @@ from liex_lab.simulation.pose_prior import (
     KINDS,
     Posture,
     bend_profile,
-    centred,
     clearance,
-    draw_angles,
     draw_postures,
     hung,
     root_rotation,
     stand,
 )
-from liex_lab.simulation.recording import SyntheticSession, assemble
 from liex_lab.simulation.scene import SimulatedScene, floor_point
-from liex_lab.simulation.species import (
-    NEAR_SHARE,
-    NEAREST_MM,
-    FishSpecies,
-    GenericSpecies,
-    MouseSpecies,
-    Sensor,
-    Species,
-)
 
 Array = NDArray[np.float64]
 Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]
@@ -62,67 +49,8 @@ _BLEND_S = 0.12  # standard deviation of the Gaussian blend between postures
 
 _GLIDE_S = 0.35  # time constant of a glide's speed
 _BOUT_SPEED = (1.0, 5.0)  # that a bout reaches, body lengths/s
+NEAREST_MM = 180.0  # of a fish to the camera: nearer, a large one does not fit in the image
 _BEND_PER_TURN = 0.55  # degrees per joint for each rad/s of turning
-
-
-def moving_session(
-    species: Species,
-    seed: int | list[int],
-    n_frames: int,
-    *,
-    sensor: Sensor | None = None,
-    family: str = "train",
-    noise: float = 1.0,
-    erosion_px: int = 0,
-    object_share: float = 0.0,
-    spine_mm: float | None = None,
-    name: str = "",
-) -> SyntheticSession:
-    """A recording of one animal that moves around, drawn from the seed.
-
-    A mouse walks, turns, rears and curls up, a fish swims in bouts; any other animal moves around
-    and changes its posture.
-
-    Args:
-        species: of the animal.
-        seed: seed or seeds of all random numbers.
-        n_frames: length of the recording, at the species' rate.
-        sensor: the camera's make; None is the species' last.
-        family: of body shapes, see `body.variation`.
-        noise: multiplies the sensor's random errors and its rate of holes.
-        erosion_px: pixels stripped off the animal's outline.
-        object_share: share of frames with a distractor.
-        spine_mm: length of the animal, mm; None draws it.
-        name: of the recording; '' is its kind of locomotion.
-
-    Returns:
-        The recording with its truth.
-    """
-    rng = np.random.default_rng(seed)
-    sensor = sensor or species.sensors[-1]
-    length = float(spine_mm or species.skeleton.length * rng.uniform(*species.sizes))
-    scene = SimulatedScene.draw(rng, sensor.camera, length, species.setting)
-    shape = species.shapes(rng, family, 1)
-    moves: dict[type[Species], tuple[str, Callable[..., tuple[Pose, Array]]]] = {
-        MouseSpecies: ("walking", walk),
-        FishSpecies: ("swimming", _swim),
-        GenericSpecies: ("moving", _roam),
-    }
-    kind, move = moves[type(species)]
-    pose, girth = move(rng, scene, species, shape, length, n_frames)
-    contents = assemble(
-        rng, scene, sensor, species, length, shape, pose, girth, noise, erosion_px, object_share
-    )
-    if contents.bends is not None:
-        steps = rng.normal(0.0, 0.05, contents.bends.shape)
-        contents.bends[:] = contents.bends[:1] + 4.0 * smoothed(steps, _BLEND_S * _RATE_HZ)
-    times = np.arange(n_frames) * species.frame_ns
-    return SyntheticSession(name or kind, scene, contents, times)
-
-
-def walking_session(seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-    """A recording of the preset mouse, see `moving_session`."""
-    return moving_session(MouseSpecies(), seed, n_frames, **settings)
 
 
 # Walking.
@@ -131,7 +59,7 @@ def walking_session(seed: int | list[int], n_frames: int, **settings: Any) -> Sy
 def walk(
     rng: np.random.Generator,
     scene: SimulatedScene,
-    species: MouseSpecies,
+    skeleton: Skeleton,
     shape: BodyShape,
     spine_mm: float,
     n_frames: int,
@@ -144,7 +72,7 @@ def walk(
         rng: random number generator; postures are drawn before the path, so that one seed gives the
             same postures in every arena.
         scene: the arena.
-        species: the species.
+        skeleton: of the mouse.
         shape: its body, a batch of one.
         spine_mm: its length, mm.
         n_frames: number of frames.
@@ -154,7 +82,6 @@ def walk(
     Returns:
         Poses (n_frames) in the arena frame, and girths (n_frames,).
     """
-    skeleton = species.skeleton
     body = shape[0].broadcast(n_frames)
     kinds, spines_per_s = (script or walk_script)(rng, n_frames)
     posture = _flow(rng, skeleton, body, kinds)
@@ -303,20 +230,19 @@ def _steered(
     return position, heading
 
 
-# Swimming, and moving as any animal.
+# Swimming.
 
 
-def _swim(
+def swim(
     rng: np.random.Generator,
     scene: SimulatedScene,
-    species: FishSpecies,
+    skeleton: Skeleton,
     shape: Body,
     length: float,
     n_frames: int,
+    step_s: float,
 ) -> tuple[Pose, Array]:
-    """The motion of one fish, and its girths."""
-    skeleton = species.skeleton
-    step_s = species.frame_ns * 1e-9
+    """The motion of one fish, and its girths, likewise, with `step_s` between two frames, s."""
     speed, turning, amplitude, beat = _swim_script(rng, n_frames, step_s)
     # turns and waves run from head to tail
     hind = np.concatenate([np.zeros(2), turning[:-2]]) if n_frames > 2 else turning
@@ -341,40 +267,6 @@ def _swim(
     position, heading = wander(rng, scene, length, speed, turning, pitch, water, step_s)
     pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
     pose.root.translation[:] += position
-    return pose, size
-
-
-def _roam(
-    rng: np.random.Generator,
-    scene: SimulatedScene,
-    species: GenericSpecies,
-    shape: Body,
-    length: float,
-    n_frames: int,
-) -> tuple[Pose, Array]:
-    """The motion of one animal of any kind, and its girths."""
-    skeleton = species.skeleton
-    step_s = species.frame_ns * 1e-9
-    size = np.full(n_frames, length / skeleton.length)
-    # mean number of frames of a posture
-    slow = 0.5 / step_s
-    starts = np.where(rng.random(n_frames) < 1.0 / slow, np.arange(n_frames), 0)
-    drawn = draw_angles(rng, skeleton, n_frames)[np.maximum.accumulate(starts)]
-    angles = smoothed(drawn.reshape(n_frames, -1), 0.4 * slow).reshape(drawn.shape)
-    speed = np.maximum(smoothed(rng.normal(0.4, 0.8, n_frames), slow), 0.0)
-    turning = smoothed(rng.normal(0.0, 3.0, n_frames), slow)
-    level = np.zeros(n_frames)
-    flat = centred(skeleton, angles, root_rotation(level, level, level), size)
-    low, high = species.extent(flat, shape[0].broadcast(n_frames), size)
-    least = -float(low.min()) + 1.0
-    camera_mm = float(scene.T_arena_camera.translation[2])
-    top = NEAR_SHARE * camera_mm - float(high.max()) if species.floats else 0.0
-    water = (least, max(top, least))
-    position, heading = wander(rng, scene, length, speed, turning, level, water, step_s)
-    pose = centred(skeleton, angles, root_rotation(heading, level, level), size)
-    pose.root.translation[:] += position
-    if not species.floats:
-        pose.root.translation[:, 2] -= position[:, 2] + low
     return pose, size
 
 
@@ -457,6 +349,11 @@ def wander(
 
     run = speed * length * step_s
     return _steered(scene, home, start, azimuth, length, 0.6 * length, run, pitch, water, turn)
+
+
+def waver(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Changes of a tail's bends, rad, over frames and rings."""
+    return 4.0 * smoothed(rng.normal(0.0, 0.05, shape), _BLEND_S * _RATE_HZ)
 
 
 def smoothed(rows: Array, frames: float) -> Array:

@@ -1,164 +1,46 @@
-"""Synthetic data generators, one per animal: training patches, test splits, recordings with truth.
-
-Each simulator renders a posed body mesh through a depth camera with a sensor noise model and
-returns the exact pose with every depth image. Animals have a pose and a locomotion model
-(`BodySimulator` of a `Species`), the hand its own scene (`HandSimulator`). Everything is drawn from
-seeds, so that any part of a set can be reproduced, in any order.
-"""
+"""Virtual animals by name, test sequences for tracking, and recordings by address."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import parse_qsl
 
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import fitting
 from liex_lab.recordings.recording import Recording
-from liex_lab.simulation import corruptions, training_patches
+from liex_lab.simulation import corruptions
 from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.foreign import KINDS, SEALED_BODY, ForeignRecording
-from liex_lab.simulation.hand.simulator import (
-    NYU_SENSOR,
-    HandFrameContents,
-    HandSession,
-    HandSimulator,
-    find_reference,
-)
-from liex_lab.simulation.locomotion import moving_session
-from liex_lab.simulation.recording import (
-    FRAME_NS,
-    OTHER_CAMERA,
-    SEALED_SEED,
-    SPLITS,
-    FrameContents,
-    SyntheticSession,
-    TrueRecording,
-    planned,
-)
+from liex_lab.simulation.hand.simulator import HandSpecies, find_reference
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
-from liex_lab.simulation.species import (
-    BY_NAME,
-    FishSpecies,
-    GenericSpecies,
-    MouseSpecies,
-    Sensor,
-    Species,
-    unseen,
-)
-from liex_lab.simulation.training_patches import TrainingPatches
-
-Array = NDArray[np.float64]
+from liex_lab.simulation.sensors import BY_NAME, Sensor
+from liex_lab.simulation.species import FishSpecies, GenericSpecies, MouseSpecies, Species
 
 
-@dataclass(frozen=True)
-class BodySimulator:
-    """Source of synthetic training and test data of an animal described by a `Species`.
-
-    Attributes:
-        species: the animal's species.
-        splits: names of the test splits.
-        protocol: a sentence on the test splits, for reports of results.
-        test_postures: '': postures follow from the seeds alone.
-        sources: source of the training images.
-    """
-
-    species: Species
-    splits: tuple[str, ...] = tuple(SPLITS)
-    protocol: str = (
-        "each with its own camera, arena, animal; the background, the floor, the blob and the "
-        "animal's size are found by the product, nothing is handed over. "
-    )
-    test_postures: str = ""
-    sources: str = "rendered from a seed; no recording of an animal was used"
-
-    @property
-    def skeleton(self) -> Skeleton:
-        """The animal's skeleton."""
-        return self.species.skeleton
-
-    def training_blocks(
-        self, seed: int, n_blocks: int, **settings: Any
-    ) -> Iterator[TrainingPatches]:
-        """Blocks of training patches with truth.
-
-        Args:
-            seed: of the whole set.
-            n_blocks: number of blocks.
-            **settings: keyword arguments as in `training_patches.training_blocks`.
-
-        Returns:
-            An iterator of sets of patches, one per block.
-        """
-        return training_patches.training_blocks(seed, n_blocks, self.species, **settings)
-
-    def test_split(
-        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
-    ) -> list[SyntheticSession]:
-        """The recordings of a split: 40 of 50 frames, equally from each sensor.
-
-        Args:
-            name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
-                `recording.SEALED`.
-            spine_mm: length of every animal, mm; None draws it.
-            n_sessions: number of recordings, from the first on.
-
-        Returns:
-            One recording of independent postures per session.
-
-        Raises:
-            LiexError: there is no split of this name.
-        """
-        sessions = []
-        for turn, kind, settings in planned(name, n_sessions, SPLITS, SEALED_SEED):
-            sensors = self.species.sensors
-            if kind == OTHER_CAMERA:
-                sensors = unseen(sensors)
-            settings |= {"sensor": sensors[turn % len(sensors)], "spine_mm": spine_mm}
-            settings["erosion_px"] *= settings["sensor"].stride
-            sessions.append(SyntheticSession.draw(species=self.species, **settings))
-        return sessions
-
-    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> SyntheticSession:
-        """A continuous recording of one moving animal.
-
-        Args:
-            seed: seed or seeds of all random numbers.
-            n_frames: length of the recording.
-            **settings: further keyword arguments of `locomotion.moving_session`.
-
-        Returns:
-            The recording with its truth.
-        """
-        return moving_session(self.species, seed, n_frames, **settings)
-
-
-Simulator = BodySimulator | HandSimulator
-
-
-def world_of(skeleton: Skeleton) -> Simulator:
-    """The simulator of an animal; the generic one for other names than those below.
+def world_of(skeleton: Skeleton) -> Species:
+    """The species of an animal; the generic one for other names than those below.
 
     Args:
-        skeleton: of the animal; the names 'mouse', 'fish' and 'hand' have their own simulators.
+        skeleton: of the animal; the names 'mouse', 'fish' and 'hand' have species of their own.
 
     Returns:
-        The simulator; that of the hand uses labelled test postures if `find_reference` finds any.
+        The species; the hand uses labelled test postures if `find_reference` finds any.
     """
     if skeleton.name == "hand":
-        return HandSimulator(skeleton, find_reference())
+        return HandSpecies(skeleton, reference=find_reference())
     known: dict[str, Callable[[Skeleton], Species]] = {
         "mouse": MouseSpecies,
         "fish": FishSpecies,
     }
-    return BodySimulator(known.get(skeleton.name, GenericSpecies.of)(skeleton))
+    return known.get(skeleton.name, GenericSpecies.of)(skeleton)
 
 
 # Benchmark sequences for tracking: one moving animal, clean or corrupted, with exact truth.
@@ -171,61 +53,15 @@ SEQUENCES = {
 }
 
 
-class TestSequence(TrueRecording):
-    """A recording with its truth and events.
-
-    Attributes:
-        scene: the recording without the losses.
-        events: in order of their start.
-    """
-
-    __test__ = False
-
-    def __init__(
-        self, scene: SyntheticSession | HandSession, events: list[Event], loss: Loss, name: str
-    ) -> None:
-        """Apply losses to a recording and keep its truth.
-
-        Args:
-            scene: the recording without the losses.
-            events: its events, in order of start.
-            loss: readings that are lost in its frames.
-            name: of the sequence.
-        """
-        super().__init__(name, scene.camera, scene.times_ns.copy(), **scene.truth)
-        self.scene = scene
-        self.events = events
-        self._loss = loss
-
-    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth images of a range of frames, with the losses.
-
-        Args:
-            start: first frame.
-            stop: one past the last frame.
-
-        Returns:
-            (stop - start, H, W) float32 mm, 0 if unread.
-        """
-        scene = self.scene
-        depths = scene.depths(start, stop)
-        middle = self.joints_camera.mean(axis=1)
-        reach = 1.2 * self.spine_mm * scene.camera.fx / middle[:, 2]
-        still = scene.scene.still if isinstance(scene, SyntheticSession) else None
-        middle_px = scene.camera.project(middle)
-        self._loss.apply(depths, still, start, scene.contents.seeds, middle_px, reach)
-        return depths
-
-
 def tracking_sequence(
-    world: Simulator,
+    world: Species,
     name: str,
     *,
     seed: int | None = None,
     n_frames: int | None = None,
     sensor: Sensor | None = None,
     spine_mm: float | None = None,
-) -> TestSequence:
+) -> RenderedRecording:
     """The fixed sequence 'easy' or 'hard' of an animal; other seeds make similar ones.
 
     hard: bursts of holes, dropped frames, a bar passing between camera and animal, a second object,
@@ -233,7 +69,7 @@ def tracking_sequence(
     speed.
 
     Args:
-        world: the animal's simulator.
+        world: the animal.
         name: 'easy' or 'hard', a key of `SEQUENCES`.
         seed: another seed makes a development sequence; None is the fixed one.
         n_frames: its length; None is the fixed one.
@@ -248,11 +84,7 @@ def tracking_sequence(
     """
     if name not in SEQUENCES:
         raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
-    if isinstance(world, HandSimulator):
-        sensor, step_ns, floats = sensor or NYU_SENSOR, FRAME_NS, True
-    else:
-        species = world.species
-        sensor, step_ns, floats = sensor or species.sensors[0], species.frame_ns, species.floats
+    sensor = sensor or world.sensors[0]
     usual_frames, usual_seed, noise, erosion_px, corrupted = SEQUENCES[name]
     n = n_frames or usual_frames
     own_seed = [usual_seed if seed is None else seed]
@@ -261,7 +93,7 @@ def tracking_sequence(
     steps = np.ones(n, np.int64)
     pace = np.ones(n, np.int64)
     if corrupted:
-        events, steps = corruptions.draw_script(rng, n, step_ns * 1e-9)
+        events, steps = corruptions.draw_script(rng, n, world.frame_ns * 1e-9)
         pace = corruptions.pace(rng, events, n)
     rows = np.cumsum(np.concatenate([[0], (steps * pace)[1:]]))
     base = world.motion(
@@ -272,65 +104,21 @@ def tracking_sequence(
         erosion_px=erosion_px * sensor.stride,
         spine_mm=spine_mm,
     )
-    times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(step_ns)
-    loss = Loss.draw(rng, events, base.camera, base.joints_camera[rows], base.spine_mm, floats)
-    title = f"track-{name}-{base.skeleton.name}-{own_seed[0]}"
-    contents: Any = base.contents[rows]
-    if events:
-        contents, hidden = _with_objects(rng, world, base, rows, events, floats)
-        events = sorted([*events, *hidden], key=lambda event: (event.start, event.stop))
-    scene = (
-        HandSession(title, base.skeleton, base.sensor, contents, times)
-        if isinstance(base, HandSession)
-        else SyntheticSession(title, base.scene, contents, times)
+    times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(world.frame_ns)
+    joints, length = base.joints_camera[rows], base.spine_mm
+    loss = Loss.draw(rng, events, base.camera, joints, length, world.floats)
+    objects = corruptions.draw_objects(
+        rng, events, base.stage.scene, base.joints_arena[rows], length, world.objects, world.floats
     )
-    return TestSequence(scene, events, loss, title)
-
-
-def _with_objects(
-    rng: np.random.Generator,
-    world: Simulator,
-    base: SyntheticSession | HandSession,
-    rows: NDArray[np.int64],
-    events: list[Event],
-    floats: bool,
-) -> tuple[FrameContents | HandFrameContents, list[Event]]:
-    """Some moments of a recording with an occluder and a distractor, and its hidden spans."""
-
-    def beside(rng: np.random.Generator, joints: Array, length_mm: float) -> Array:
-        if isinstance(base, HandSession):
-            return corruptions.beside_hand(rng, joints, length_mm)
-        assert isinstance(world, BodySimulator)
-        return corruptions.beside_animal(rng, base.scene, joints, length_mm, world.species.objects)
-
-    T_arena_camera = base.T_arena_camera
-    in_arena = corruptions.draw_objects(
-        rng,
-        events,
-        T_arena_camera.translation,
-        base.joints_arena[rows],
-        base.spine_mm,
-        beside,
-        floats,
-    )
-    objects = T_arena_camera.inverse() @ in_arena
-    contents: Any = base.contents[rows]
-    if isinstance(base, HandSession):
-        body = contents.hand
-    else:
-        mesh = base.surface.vertices(contents.pose, contents.shape, contents.girth, contents.bends)
-        body = T_arena_camera.inverse() @ mesh[:, : base.surface.n_trunk_vertices]
-    spans = [np.arange(event.start, event.stop) for event in events if event.kind == "occluder"]
-    occluded = np.concatenate(spans) if spans else np.zeros(0, np.int64)
-    occluder = objects[:, : objects.shape[1] // 2]
-    share = corruptions.visible_share(body[:, ::4], occluder, base.camera, occluded)
-    contents = replace(
-        contents,
-        objects=objects if isinstance(base, HandSession) else in_arena,
-        shown=np.ones(len(rows), np.bool_),
-        object_faces=corruptions.TWO_FACES,
-    )
-    return contents, corruptions.hidden_spans(share)
+    stage = replace(base.stage[rows], times_ns=times, objects=objects)
+    title = f"track-{name}-{world.skeleton.name}-{own_seed[0]}"
+    sequence = RenderedRecording(title, stage, loss=loss)
+    share = np.ones(n)
+    occluded = np.flatnonzero(objects[0].moment >= 0)
+    share[occluded] = sequence.visible(stage.actors[0], occluded)
+    events += corruptions.hidden_spans(share)
+    sequence.events = sorted(events, key=lambda event: (event.start, event.stop))
+    return sequence
 
 
 # Addresses of synthetic recordings, `synthetic:<kind>?<key>=<value>&...`, opened like a file.
@@ -363,7 +151,7 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             one.
 
     Returns:
-        A recording with truth (a `TrueRecording` or a `ForeignRecording`).
+        A recording with truth (a `RenderedRecording` or a `ForeignRecording`).
 
     Raises:
         RecordingError: the kind, a setting or its value is invalid, or the animal is missing.

@@ -1,10 +1,16 @@
-"""Interface between an animal and the renderer: sensors, surroundings, body shapes, pose prior.
+"""Virtual animals: bodies, postures, movements and surroundings, and what cameras record of them.
 
-`Species` is the interface that `training_patches`, `recording` and `locomotion` use; `MouseSpecies`
-is the mouse, `FishSpecies` the zebrafish, `GenericSpecies` any animal with a skeleton.
+A `Species` films recordings (independent postures, or an animal that moves), the fixed test splits,
+and training patches; everything is drawn from seeds, so that any part of a set can be reproduced,
+in any order. `MouseSpecies` is the mouse, `FishSpecies` the zebrafish, `GenericSpecies` any animal
+with a skeleton.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +19,10 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, BodyShape, Surface
 from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.body.variation import draw_shapes, draw_tail_bends, vary_body
-from liex_lab.optics.camera import (
-    AZURE_KINECT,
-    KINECT_V2,
-    PRIMESENSE,
-    PRIMESENSE_QVGA,
-    RAYTRIX_R5,
-    RAYTRIX_R5_LONG,
-    RAYTRIX_R5_WIDE,
-    REALSENSE_D435,
-    Camera,
-)
-from liex_lab.simulation import _sensor_kernels as k
+from liex_lab.errors import LiexError
+from liex_lab.simulation import training_patches
+from liex_lab.simulation._sensor_kernels import ANIMAL
+from liex_lab.simulation.locomotion import NEAREST_MM, smoothed, swim, walk, wander, waver
 from liex_lab.simulation.pose_prior import (
     FISH_KINDS,
     FISH_SHARES,
@@ -39,165 +37,37 @@ from liex_lab.simulation.pose_prior import (
     root_rotation,
     sample_postures,
 )
-from liex_lab.simulation.scene import ARENA, OBJECTS, SceneSpec
+from liex_lab.simulation.recording import (
+    FRAME_NS,
+    OTHER_CAMERA,
+    SEALED,
+    SEALED_SEED,
+    SPLITS,
+    Actor,
+    RenderedRecording,
+    Split,
+    Stage,
+    distractor,
+    split_of,
+)
+from liex_lab.simulation.rendering import Solid
+from liex_lab.simulation.scene import (
+    ARENA,
+    OBJECTS,
+    SceneSpec,
+    SimulatedScene,
+    draw_views,
+    outline_of,
+)
+from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, SENSORS, Sensor, draw_units, unseen
+from liex_lab.simulation.training_patches import PER_SESSION, TrainingPatches
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sensor:
-    """A make of depth sensor: its camera and its noise.
-
-    Attributes:
-        name: of the make.
-        camera: its camera.
-        kind: number of its noise model, `PRIMESENSE_KIND`, `KINECT_V2_KIND` or `LIGHT_FIELD_KIND`.
-        unit_mm: step of its depth, mm.
-        stride: only every `stride`-th pixel of its large depth images is read.
-    """
-
-    name: str
-    camera: Camera
-    kind: int
-    unit_mm: float = 1.0
-    stride: int = 1
-
-    def coarse(self, parameters: Array) -> Array:
-        """Parameters of this sensor's units for images of every `stride`-th pixel.
-
-        Args:
-            parameters: (n, N_PARAMETERS) of full-resolution images.
-
-        Returns:
-            (n, N_PARAMETERS), the lengths in pixels divided by the stride.
-        """
-        coarse = parameters.copy()
-        coarse[:, [k.GRID, k.JITTER]] /= self.stride
-        return coarse
-
-    def spread_mm(self, parameters: Array, distance_mm: Array) -> Array | float:
-        """Standard deviation of the readings of a surface by units of a light-field camera.
-
-        For other sensors it is 0, as it is negligible.
-
-        Args:
-            parameters: (n, N_PARAMETERS) of the units.
-            distance_mm: (n,) of the surface, mm.
-
-        Returns:
-            (n,) mm, or 0.0.
-        """
-        if self.kind != k.LIGHT_FIELD_KIND:
-            return 0.0
-        smooth, white, noise = (parameters[:, column] for column in (k.SMOOTH, k.WHITE, k.NOISE))
-        return noise * (distance_mm / k.TYPICAL_MM) ** 2 * np.hypot(0.8 * smooth, white)
-
-    def draw(
-        self, rng: np.random.Generator, n: int, fur: Array, noise: float = 1.0, erosion_px: int = 0
-    ) -> Array:
-        """Parameters of n units of this sensor, each recording one animal.
-
-        Args:
-            rng: random number generator.
-            n: number of units.
-            fur: (n,) of the animals, from 0 (sleek) to 1 (long and soft).
-            noise: multiplies random errors and the rate of holes.
-            erosion_px: pixels stripped off the animal's outline.
-
-        Returns:
-            (n, N_PARAMETERS), columns as in `_sensor_kernels`.
-        """
-        holes = 10 ** rng.uniform(-4.5, -3.0, n)
-        dark = rng.random(n) < 0.4
-        columns: dict[int, Array | float] = {
-            k.UNIT: self.unit_mm,
-            k.BACKGROUND: 1.0,
-            k.KIND: self.kind,
-            k.NOISE: noise,
-            k.EROSION: erosion_px,
-            k.FUR: fur,
-            k.HOLES: holes,
-            k.DARK: np.where(dark, 10 ** rng.uniform(-3.0, -1.7, n), 0.0),
-            k.SIDE: rng.choice([-1.0, 1.0], n),
-            k.LUMPS: rng.uniform(0.2, 1.0, n) * (0.6 + 0.8 * fur),
-        }
-        if self.kind == k.PRIMESENSE_KIND:
-            columns |= {
-                k.SMOOTH: rng.uniform(0.04, 0.11, n),  # pixels of disparity
-                k.WHITE: rng.uniform(0.01, 0.04, n),
-                k.EDGE_DROP: rng.uniform(0.05, 0.5, n),
-                k.GRID: rng.uniform(3.0, 5.5, n),
-                k.JITTER: rng.uniform(0.3, 0.9, n),
-            }
-        elif self.kind == k.LIGHT_FIELD_KIND:
-            columns |= {
-                k.SMOOTH: rng.uniform(0.4, 1.2, n),  # mm at 250 mm
-                k.WHITE: rng.uniform(0.1, 0.4, n),
-                k.LUMPS: rng.uniform(0.05, 0.25, n),
-                k.GRID: rng.uniform(5.0, 11.0, n),  # the footprint of a few micro lenses, pixels
-                k.JITTER: rng.uniform(0.5, 2.5, n),
-                k.BACKGROUND: 0.5,
-                k.OUTLIERS: rng.uniform(2.3, 3.2, n),  # standard deviations of a field
-                # quantiles of a field: from a few per cent to a third of smooth skin has no
-                # texture, less of the rest
-                k.DARK: rng.uniform(-2.6, -0.45, n),
-                k.HOLES: rng.uniform(-4.0, -1.2, n),
-                # the maker's software fills unread pixels
-                k.FLYING: (rng.random(n) < 0.5).astype(float),
-            }
-        else:
-            columns |= {
-                k.SMOOTH: rng.uniform(0.4, 1.3, n),  # of (1 + z^2) / 2 mm, z in metres
-                k.WHITE: rng.uniform(0.3, 1.1, n),
-                k.EDGE_DROP: rng.uniform(0.0, 0.15, n),
-                k.GRID: rng.uniform(2.5, 5.0, n),
-                k.FLYING: rng.uniform(0.2, 0.8, n),
-                # dark hair has a small constant depth error
-                k.BIAS: np.where(dark, rng.uniform(-2.0, 4.0, n), rng.uniform(-0.5, 1.0, n)),
-            }
-        p = np.zeros((n, k.N_PARAMETERS))
-        for column, values in columns.items():
-            p[:, column] = values
-        return p
-
-
-PRIMESENSE_SENSOR = Sensor("PrimeSense", PRIMESENSE, k.PRIMESENSE_KIND)
-KINECT_V2_SENSOR = Sensor("Kinect v2", KINECT_V2, k.KINECT_V2_KIND)
-PRIMESENSE_QVGA_SENSOR = Sensor("PrimeSense QVGA", PRIMESENSE_QVGA, k.PRIMESENSE_KIND)
-RAYTRIX_R5_SENSOR = Sensor("Raytrix R5", RAYTRIX_R5, k.LIGHT_FIELD_KIND, unit_mm=0.02, stride=2)
-SENSORS = (
-    PRIMESENSE_SENSOR,
-    KINECT_V2_SENSOR,
-)  # makes used for sessions and training windows
-BY_NAME = {
-    sensor.name.lower().replace(" ", "-"): sensor
-    for sensor in (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, PRIMESENSE_QVGA_SENSOR, RAYTRIX_R5_SENSOR)
-}
-# for each noise model, cameras with a focal length and resolution that training does not use: those
-# in training are within 3 % of the makes in `SENSORS`, of the Raytrix R5 above or of the NYU camera
-_UNSEEN = {
-    k.PRIMESENSE_KIND: (Sensor("RealSense D435", REALSENSE_D435, k.PRIMESENSE_KIND),),
-    k.KINECT_V2_KIND: (Sensor("Azure Kinect", AZURE_KINECT, k.KINECT_V2_KIND),),
-    k.LIGHT_FIELD_KIND: (
-        Sensor("Raytrix R5 wide", RAYTRIX_R5_WIDE, k.LIGHT_FIELD_KIND, unit_mm=0.02, stride=2),
-        Sensor("Raytrix R5 long", RAYTRIX_R5_LONG, k.LIGHT_FIELD_KIND, unit_mm=0.02, stride=2),
-    ),
-}
-
-
-def unseen(sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
-    """Cameras that are not used in training, with the noise models of the given sensors.
-
-    Args:
-        sensors: makes used for training images.
-    """
-    kinds = dict.fromkeys(sensor.kind for sensor in sensors)
-    return tuple(sensor for kind in kinds for sensor in _UNSEEN[kind])
-
-
-@dataclass(frozen=True)
 class Species:
-    """An animal as used by the renderer; everything is drawn from the given generator.
+    """An animal as rendered; everything is drawn from the given generator or seed.
 
     Attributes:
         skeleton: of the animal.
@@ -207,15 +77,36 @@ class Species:
         sizes: smallest and largest animal over the nominal size.
         floats: whether it is above the floor, not on it.
         frame_ns: between two frames of a recording, ns.
+        splits: the test splits.
+        sealed_seed: of the held-out split, see `recording.SEALED`.
+        patch_px: side of training patches, px, enough for mice of up to 70 mm.
+        sources: source of the training images.
     """
 
     skeleton: Skeleton
     sensors: tuple[Sensor, ...]
-    setting: SceneSpec
-    objects: tuple[str, ...]
+    setting: SceneSpec = ARENA
+    objects: tuple[str, ...] = OBJECTS
     sizes: tuple[float, float] = SIZE_RANGE
     floats: bool = False
-    frame_ns: int = 33_333_333
+    frame_ns: int = FRAME_NS
+    splits: ClassVar[Mapping[str, Split]] = SPLITS
+    sealed_seed: ClassVar[int] = SEALED_SEED
+    patch_px: ClassVar[int] = 144
+    sources: ClassVar[str] = "rendered from a seed; no recording of an animal was used"
+
+    @property
+    def protocol(self) -> str:
+        """A sentence on the test splits, for reports of results."""
+        return (
+            "each with its own camera, arena, animal; the background, the floor, the blob and the "
+            "animal's size are found by the product, nothing is handed over. "
+        )
+
+    @property
+    def test_postures(self) -> str:
+        """Source of the test postures, one phrase; '' if they follow from the seeds alone."""
+        return ""
 
     def shapes(self, rng: np.random.Generator, family: str, n: int) -> Body:
         """Bodies of a family of shapes.
@@ -242,7 +133,24 @@ class Species:
             camera_mm: (n,) heights of the cameras above the floor, mm.
 
         Returns:
-            The poses, base above the origin, with girths and kinds.
+            The poses, base above the origin, and girths.
+        """
+        raise NotImplementedError
+
+    def move(
+        self, rng: np.random.Generator, scene: SimulatedScene, shape: Any, length: float, n: int
+    ) -> tuple[Pose, Array]:
+        """The motion of one animal in a scene.
+
+        Args:
+            rng: random number generator.
+            scene: the arena and its camera.
+            shape: its body, a batch of one.
+            length: of the animal, mm.
+            n: number of frames.
+
+        Returns:
+            Poses (n) in the arena frame, and girths (n,).
         """
         raise NotImplementedError
 
@@ -254,6 +162,246 @@ class Species:
         """
         return None
 
+    @property
+    def other_sensors(self) -> tuple[Sensor, ...]:
+        """Cameras that are not used in training."""
+        return unseen(self.sensors)
+
+    def test_split(
+        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
+    ) -> list[RenderedRecording]:
+        """The recordings of a split: 40 of 50 independent frames, equally from each sensor.
+
+        Args:
+            name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
+                `recording.SEALED`.
+            spine_mm: length of every animal, mm; None draws it.
+            n_sessions: number of recordings, from the first on.
+
+        Returns:
+            The recordings, recording k named after the split and k.
+
+        Raises:
+            LiexError: there is no split of this name.
+        """
+        if name not in (*self.splits, SEALED):
+            raise LiexError(f"there is no split '{name}'; known are {', '.join(self.splits)}")
+        recordings = []
+        for k in range(n_sessions):
+            kind = split_of(name, k)
+            seed, family, noise, erosion_px, object_share = self.splits[kind]
+            sensors = self.other_sensors if kind == OTHER_CAMERA else self.sensors
+            turn = k // len(self.splits) if name == SEALED else k
+            sensor = sensors[turn % len(sensors)]
+            recording = self.film(
+                [self.sealed_seed if name == SEALED else seed, k],
+                sensor=sensor,
+                family=family,
+                noise=noise,
+                erosion_px=erosion_px * sensor.stride,
+                object_share=object_share,
+                spine_mm=spine_mm,
+                name=f"{name}-{k:02d}",
+            )
+            recordings.append(recording)
+        return recordings
+
+    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> RenderedRecording:
+        """A continuous recording of one moving animal, see `film`."""
+        return self.film(seed, n_frames, moving=True, **settings)
+
+    def film(
+        self,
+        seed: int | list[int],
+        n_frames: int = 50,
+        *,
+        moving: bool = False,
+        sensor: Sensor | None = None,
+        family: str = "train",
+        noise: float = 1.0,
+        erosion_px: int = 0,
+        object_share: float = 0.0,
+        spine_mm: float | None = None,
+        name: str = "",
+    ) -> RenderedRecording:
+        """A recording of one animal before one camera.
+
+        Args:
+            seed: seed or seeds of all random numbers.
+            n_frames: length of the recording, at the species' rate.
+            moving: whether the animal moves; else postures and places are independent.
+            sensor: the camera's make; None is the species' last.
+            family: of body shapes, see `body.variation`.
+            noise: multiplies the sensor's random errors and its rate of holes.
+            erosion_px: pixels stripped off the animal's outline.
+            object_share: share of frames with a distractor.
+            spine_mm: length of the animal, mm; None draws it.
+            name: of the recording; '' names it after the animal.
+
+        Returns:
+            The recording with its truth.
+        """
+        rng = np.random.default_rng(seed)
+        sensor = sensor or self.sensors[-1]
+        length = float(spine_mm or self.skeleton.length * rng.uniform(*self.sizes))
+        stage = self._stage(
+            rng, sensor, length, n_frames, moving, family, noise, erosion_px, object_share
+        )
+        return RenderedRecording(name or f"synthetic-{self.skeleton.name}", stage)
+
+    def _stage(
+        self,
+        rng: np.random.Generator,
+        sensor: Sensor,
+        length: float,
+        n: int,
+        moving: bool,
+        family: str,
+        noise: float,
+        erosion_px: int,
+        object_share: float,
+    ) -> Stage:
+        """Everything before the camera in `film`, of an animal of a given length, mm."""
+        scene = SimulatedScene.draw(rng, sensor.camera, length, self.setting)
+        shape = self.shapes(rng, family, 1)
+        if moving:
+            pose, girth = self.move(rng, scene, shape, length, n)
+        else:
+            size = np.full(n, length / self.skeleton.length)
+            camera_mm = np.full(n, scene.T_arena_camera.translation[2])
+            pose, girth = self.postures(rng, size, shape[0].broadcast(n), camera_mm)
+        surface = Surface.of(self.skeleton)
+        bends = self.bends(rng, n)
+        trunk = surface.vertices(pose, shape[0], girth, bends)[:, : surface.n_trunk_vertices]
+        if not moving:
+            bottoms = trunk[..., 2].min(axis=1) if self.floats else None
+            shift = scene.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1), bottoms)
+            pose.root.translation[:, :2] += shift
+            trunk[..., :2] += shift[:, None]
+        kind = str(rng.choice(self.objects))
+        scale = self.setting.scale
+        item = distractor(rng, scene, kind, trunk, length, object_share, scale, sensor.stride)
+        parameters = sensor.draw(rng, 1, shape.fur, noise, erosion_px)
+        seeds = rng.integers(1, 2**63, n).astype(np.uint64)
+        if moving and bends is not None:
+            bends = bends[:1] + waver(rng, bends.shape)
+        actor = Actor(surface, length, shape, pose, girth, bends, np.ones(n, np.bool_))
+        return Stage(
+            scene,
+            self.skeleton,
+            (actor,),
+            (item,),
+            np.repeat(parameters, n, axis=0),
+            seeds,
+            np.arange(n) * self.frame_ns,
+        )
+
+    def training_blocks(
+        self,
+        seed: int,
+        n_blocks: int,
+        *,
+        first: int = 0,
+        family: str = "train",
+        degraded_share: float = 0.0,
+        spine_mm: float | None = None,
+        window_px: int | None = None,
+        per_session: int = PER_SESSION,
+    ) -> Iterator[TrainingPatches]:
+        """Blocks of `training_patches.BLOCK` training patches from block `first` on.
+
+        They are bit-identical for a seed, for any number of threads.
+
+        Args:
+            seed: of the whole set; a block depends only on the seed and its number.
+            n_blocks: number of blocks.
+            first: number of the first block.
+            family: of body shapes, one of `body.variation.FAMILIES`.
+            degraded_share: share of mini-sessions with 1 to 2.5 times the noise; half of them have
+                an outline eroded by one more pixel.
+            spine_mm: mean length of the animals, mm; None uses the skeleton's own.
+            window_px: side of the patches, px, that contains the animal with a margin; None is
+                `patch_px`.
+            per_session: images of one animal with one camera, a divisor of `BLOCK`.
+
+        Yields:
+            One set of `BLOCK` patches per block.
+        """
+        window = window_px or self.patch_px
+        nominal = 1.0 if spine_mm is None else spine_mm / self.skeleton.length
+        for number in range(first, first + n_blocks):
+            rng = np.random.default_rng([seed, number])
+            yield self._block(rng, family, degraded_share, nominal, window, per_session)
+
+    def _block(
+        self,
+        rng: np.random.Generator,
+        family: str,
+        degraded_share: float,
+        nominal: float,
+        window_px: int,
+        per_session: int,
+    ) -> TrainingPatches:
+        """One block of patches of animals whose mean size over home size is `nominal`."""
+        n = training_patches.BLOCK
+        m = n // per_session
+        each = np.repeat(np.arange(m), per_session)
+        scale = self.setting.scale
+        surface = Surface.of(self.skeleton)
+        body = self.shapes(rng, family, m)
+        make = np.arange(m) % len(self.sensors)
+        intrinsics, size_px, parameters = draw_units(rng, self.sensors, make, body.fur)
+        training_patches.degrade(rng, parameters, degraded_share)
+        T_arena_camera = draw_views(rng, m, self.setting)
+        size = (nominal * rng.uniform(*self.sizes, m))[each]
+        rough = scale * rng.uniform(0.0, 1.0, m)
+        error = rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale]
+        views = training_patches.floor_views(
+            intrinsics, size_px, T_arena_camera, parameters, error, rough
+        )[each]
+        height = views.T_arena_camera.translation[:, 2]
+        pose, girth = self.postures(rng, size, body[each], height)
+        training_patches.place(rng, self.skeleton, pose, views, self.floats)
+        vertices = surface.vertices(pose, body[each], girth, self.bends(rng, n))
+        trunk = vertices[:, : surface.n_trunk_vertices]
+        radii = (size * self.skeleton.length)[:, None] * rng.uniform(0.12, 0.5, (n, 3))
+
+        def raised(bodies: Array) -> tuple[Array, float]:
+            """Beside a floating animal it is anywhere between the floor and the animal's back."""
+            if not self.floats:
+                return radii[:, 2], 1.0
+            room = np.maximum(bodies[..., 2].max(axis=1) - radii[:, 2], 0.0)
+            return radii[:, 2] + rng.uniform(0.0, 1.0, n) * room, 1.0
+
+        gap = (5.0 * scale, 40.0 * scale)
+        neighbour = training_patches.neighbours(rng, trunk, radii, gap, raised, 10.0, 0.10)
+        training_patches.draw_walls(rng, trunk, self.setting, views)
+        seeds = rng.integers(1, 2**63, n).astype(np.uint64)
+        origin = views.around(trunk, window_px)
+        depth, background = views.render(
+            [Solid.of(vertices, surface.faces, label=ANIMAL), neighbour],
+            seeds,
+            origin,
+            (window_px, window_px),
+            learn=True,
+        )
+        pose = pose.moved(views.T_arena_camera.inverse())
+        return TrainingPatches(
+            depth,
+            background,
+            origin.astype(np.int32),
+            views.intrinsics,
+            views.floor,
+            pose.root,
+            pose.angles,
+            pose.scale,
+            pose.joints(self.skeleton),
+            size * self.skeleton.length,
+            body[each],
+            self.sensors[0].unit_mm,
+            self.sensors[0].spread_mm(views.parameters, height),
+        )
+
 
 @dataclass(frozen=True)
 class MouseSpecies(Species):
@@ -261,8 +409,6 @@ class MouseSpecies(Species):
 
     skeleton: Skeleton = field(default_factory=lambda: Skeleton.load("mouse"))
     sensors: tuple[Sensor, ...] = SENSORS
-    setting: SceneSpec = ARENA
-    objects: tuple[str, ...] = OBJECTS
 
     def shapes(self, rng: np.random.Generator, family: str, n: int) -> BodyShape:
         """Mice of a family of shapes."""
@@ -278,6 +424,12 @@ class MouseSpecies(Species):
         kinds = rng.choice(len(KINDS), len(size), p=SHARES)
         return sample_postures(rng, self.skeleton, size, shape, kinds)
 
+    def move(
+        self, rng: np.random.Generator, scene: SimulatedScene, shape: Any, length: float, n: int
+    ) -> tuple[Pose, Array]:
+        """A mouse that walks, turns, rears and curls up."""
+        return walk(rng, scene, self.skeleton, shape, length, n)
+
     def bends(self, rng: np.random.Generator, n: int) -> Array:
         """Bends of the tails (n, TAIL_RINGS), rad."""
         return draw_tail_bends(rng, n)
@@ -291,7 +443,6 @@ TANK = SceneSpec(
     clutter=("pellet", "plant"),
     scale=0.3,
 )
-NEAREST_MM = 180.0  # of a fish to the camera: nearer, a large one does not fit in the image
 
 
 @dataclass(frozen=True)
@@ -326,6 +477,12 @@ class FishSpecies(Species):
         pose.root.translation[:, 2] += low + at * (headroom - low) + rng.uniform(0.5, 2.0, n)
         return pose, size
 
+    def move(
+        self, rng: np.random.Generator, scene: SimulatedScene, shape: Any, length: float, n: int
+    ) -> tuple[Pose, Array]:
+        """A fish that swims in bouts."""
+        return swim(rng, scene, self.skeleton, shape, length, n, self.frame_ns * 1e-9)
+
 
 # tilts from which the resting orientation on the floor is chosen
 _TILTS = 8
@@ -341,7 +498,7 @@ class GenericSpecies(Species):
     """
 
     @staticmethod
-    def of(skeleton: Skeleton) -> "GenericSpecies":
+    def of(skeleton: Skeleton) -> GenericSpecies:
         """The species of a skeleton: visible by the Raytrix R5 below 35 mm of length, in a scene in
         which the whole animal is visible from anywhere, at a sufficient size.
         """
@@ -394,6 +551,34 @@ class GenericSpecies(Species):
         pose = self._fallen(rng, angles, heading, size)
         low, _ = self.extent(pose, shape, size)
         pose.root.translation[:, 2] += rng.uniform(0.0, 2.0, n) * self.setting.scale - low
+        return pose, size
+
+    def move(
+        self, rng: np.random.Generator, scene: SimulatedScene, shape: Any, length: float, n: int
+    ) -> tuple[Pose, Array]:
+        """An animal that moves about and changes its posture."""
+        skeleton = self.skeleton
+        step_s = self.frame_ns * 1e-9
+        size = np.full(n, length / skeleton.length)
+        # mean number of frames of a posture
+        slow = 0.5 / step_s
+        starts = np.where(rng.random(n) < 1.0 / slow, np.arange(n), 0)
+        drawn = draw_angles(rng, skeleton, n)[np.maximum.accumulate(starts)]
+        angles = smoothed(drawn.reshape(n, -1), 0.4 * slow).reshape(drawn.shape)
+        speed = np.maximum(smoothed(rng.normal(0.4, 0.8, n), slow), 0.0)
+        turning = smoothed(rng.normal(0.0, 3.0, n), slow)
+        level = np.zeros(n)
+        flat = centred(skeleton, angles, root_rotation(level, level, level), size)
+        low, high = self.extent(flat, shape[0].broadcast(n), size)
+        least = -float(low.min()) + 1.0
+        camera_mm = float(scene.T_arena_camera.translation[2])
+        top = NEAR_SHARE * camera_mm - float(high.max()) if self.floats else 0.0
+        water = (least, max(top, least))
+        position, heading = wander(rng, scene, length, speed, turning, level, water, step_s)
+        pose = centred(skeleton, angles, root_rotation(heading, level, level), size)
+        pose.root.translation[:] += position
+        if not self.floats:
+            pose.root.translation[:, 2] -= position[:, 2] + low
         return pose, size
 
     def extent(self, pose: Pose, shape: Body, size: Array) -> tuple[Array, Array]:

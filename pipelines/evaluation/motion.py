@@ -28,7 +28,7 @@ from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.errors import LiexError, refuse
 from liex_lab.exchange.points import PointNames, read_points
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.recording import FRAME_NS, SyntheticSession
+from liex_lab.simulation.recording import FRAME_NS
 from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.species import MouseSpecies
 
@@ -311,13 +311,12 @@ def _walk(skeleton: Skeleton, along: Array, above: float, progress: Progress) ->
     for k, seed in enumerate(_SEEDS):
         progress(k, len(_SEEDS), "a virtual mouse goes about")
         recording = world_of(skeleton).motion(seed, _PER_RECORDING)
-        assert isinstance(recording, SyntheticSession)
-        body = recording.contents
-        assert isinstance(body.shape, BodyShape)
+        (mouse,) = recording.stage.actors
+        assert isinstance(mouse.body, BodyShape)
         points.append(
             on_back(
                 skeleton,
-                (body.pose, body.girth, body.shape.broadcast(_PER_RECORDING)),
+                (mouse.pose, mouse.girth, mouse.body[0].broadcast(_PER_RECORDING)),
                 along,
                 above,
             )

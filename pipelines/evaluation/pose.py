@@ -36,8 +36,8 @@ from liex_lab.evaluation.scores import (
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
-from liex_lab.simulation import simulator, species
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation import simulator
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.track import Track
 
@@ -129,7 +129,7 @@ def unpacked(subject: Subject, found: Estimates | Guesses) -> tuple[Array, Array
 
 
 def errors_of(
-    subject: Subject, sessions: Sequence[TrueRecording], plan: Plan, progress: Progress
+    subject: Subject, sessions: Sequence[RenderedRecording], plan: Plan, progress: Progress
 ) -> PoseErrors:
     """Errors of a subject over rendered recordings.
 
@@ -316,7 +316,7 @@ def evaluate_builds(
     }
 
 
-def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
+def film(animal: str, seed: int, k: int, family: str) -> RenderedRecording:
     """Recording k of the split other-build: cameras and noise take turns.
 
     Args:
@@ -328,10 +328,10 @@ def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
     Raises:
         LiexError: the animal's simulator has one build only.
     """
-    world = simulator.world_of(Skeleton.load(animal))
-    if not isinstance(world, simulator.BodySimulator) or animal not in ("mouse", "fish"):
+    if animal not in ("mouse", "fish"):
         raise LiexError(f"the split {OTHER_BUILD} is of mouse and fish, not of '{animal}'")
-    sensors = (*world.species.sensors, *species.unseen(world.species.sensors))
+    world = simulator.world_of(Skeleton.load(animal))
+    sensors = (*world.sensors, *world.other_sensors)
     return world.motion(
         [seed],
         N_FRAMES,
@@ -342,7 +342,7 @@ def film(animal: str, seed: int, k: int, family: str) -> TrueRecording:
     )
 
 
-def track(estimator: PoseEstimator, recording: TrueRecording, plan: Plan) -> Built:
+def track(estimator: PoseEstimator, recording: RenderedRecording, plan: Plan) -> Built:
     """Track a recording as a run does; returned with its truth."""
     skeleton = estimator.skeleton
     try:

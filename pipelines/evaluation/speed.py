@@ -53,7 +53,7 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.sessions import Session
 from liex_lab.sessions.folder import folder_bytes
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.simulator import open_synthetic, world_of
 
 from ..build import build_scene, plan_of
@@ -180,7 +180,7 @@ class SpeedSample:
     @staticmethod
     def of(
         animal: str,
-        recordings: Sequence[TrueRecording],
+        recordings: Sequence[RenderedRecording],
         subject: PoseEstimator | Baseline,
         n_frames: int,
     ) -> "SpeedSample":

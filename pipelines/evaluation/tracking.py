@@ -41,6 +41,7 @@ from liex_lab.runtime.processes import threads
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.simulation import simulator
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.tracking import curve, observations, trust
 from liex_lab.tracking.particles import SEARCHED, ParticleFilter, ProcessNoise
 from liex_lab.tracking.track import Track
@@ -135,7 +136,7 @@ def evaluate_tracking(
 
 
 def follow_sequence(
-    recording: simulator.TestSequence,
+    recording: RenderedRecording,
     estimator: PoseEstimator,
     plan: Plan,
     progress: Progress = silent,
@@ -204,7 +205,7 @@ def _online(tracker: FrameTracker, observed: observations.Observations) -> Track
     return Track.join([part for part in (online.add(observed), online.close()) if part is not None])
 
 
-def _speed(tracker: FrameTracker, recording: simulator.TestSequence) -> dict[str, float]:
+def _speed(tracker: FrameTracker, recording: RenderedRecording) -> dict[str, float]:
     """Frames/s of the default tracker, on one core and on all.
 
     From depth images in memory to the smoothed track: the best of alternating repeats over the
@@ -225,7 +226,7 @@ def _speed(tracker: FrameTracker, recording: simulator.TestSequence) -> dict[str
 
 
 def paper_rows(
-    recording: simulator.TestSequence,
+    recording: RenderedRecording,
     paper: PoseEstimator,
     plan: Plan,
     progress: Progress = silent,
@@ -252,7 +253,7 @@ def paper_rows(
 
 
 def follow(
-    recording: simulator.TestSequence,
+    recording: RenderedRecording,
     estimator: PoseEstimator,
     scene: Segmenter,
     size: float,
@@ -286,7 +287,7 @@ def follow(
 
 
 def _single(
-    recording: simulator.TestSequence, paper: PoseEstimator, scene: Segmenter, size: float
+    recording: RenderedRecording, paper: PoseEstimator, scene: Segmenter, size: float
 ) -> Followed:
     """Algorithm 1 on each frame by itself."""
 
@@ -298,7 +299,7 @@ def _single(
 
 
 def _followed(
-    recording: simulator.TestSequence,
+    recording: RenderedRecording,
     estimator: PoseEstimator,
     estimate: Callable[[Sequence[DepthFrame]], tuple[Array, Array]],
 ) -> Followed:
@@ -367,7 +368,7 @@ def search_noise(
         sequences.append((recording, scene, estimator.find_size(sample, scene)))
 
     def mean_mm(
-        followed: Callable[[simulator.TestSequence, Segmenter, float], Followed],
+        followed: Callable[[RenderedRecording, Segmenter, float], Followed],
     ) -> float:
         """Mean error over the frames in view of all sequences."""
         return float(

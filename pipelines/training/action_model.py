@@ -30,11 +30,13 @@ from liex_lab.runtime.durable import replacing
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Patches
 from liex_lab.sessions import Session, evidence
-from liex_lab.simulation import _render_kernels, agents, training_patches
+from liex_lab.simulation import agents
 from liex_lab.simulation.agents import agent
 from liex_lab.simulation.agents import fish as fish_acts
 from liex_lab.simulation.agents import mouse as mouse_acts
+from liex_lab.simulation.rendering import Views
 from liex_lab.simulation.species import FishSpecies, MouseSpecies
+from liex_lab.simulation.training_patches import put_walls
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Subject
@@ -175,7 +177,7 @@ def act(
     """
     rng = np.random.default_rng([scenario.individual, scenario.seed])
     stage = staged(scenario, rng)
-    motion, rows, pose, _, _, species, camera, _, wall_mm = stage
+    motion, rows, pose, _, species, camera, _, wall_mm = stage
     window_px = 128 if scenario.animal == "fish" else 112
     tracker = PatchObserver(estimator)
     sizes = {} if sizes is None else sizes
@@ -207,9 +209,8 @@ Staged = tuple[
     NDArray[np.int64],
     Pose,
     Array,
-    Array | None,
     FishSpecies | MouseSpecies,
-    training_patches.Views,
+    Views,
     BodyShape,
     Array,
 ]
@@ -224,8 +225,8 @@ def staged(scenario: Scenario, rng: np.random.Generator) -> Staged:
 
     Returns:
         The motion on its 5 ms clock; its steps (n,) that are frames; poses (n), arena frame; girth
-        (n,); the wall that each frame shows, or None; species, camera and shape; distance (n,) from
-        the nearest wall, mm, NaN if unknown.
+        (n,); species; camera and the wall that each frame shows (n); shape; distance (n,) from the
+        nearest wall, mm, NaN if unknown.
     """
     return {"fish": _fish, "mouse": _mouse}[scenario.animal](scenario, rng)
 
@@ -234,9 +235,8 @@ def rendered(
     rng: np.random.Generator, stage: Staged, rows: slice | NDArray[np.int64], window_px: int
 ) -> Iterator[Patches]:
     """Depth around the animal in some frames of a generated scenario."""
-    _, _, pose, girth, walls, species, camera, shape, _ = stage
-    near = None if walls is None else walls[rows]
-    return agent.render_agent(rng, species, camera, shape, pose[rows], girth[rows], near, window_px)
+    _, _, pose, girth, species, views, shape, _ = stage
+    return agent.render_agent(rng, species, views[rows], shape, pose[rows], girth[rows], window_px)
 
 
 def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
@@ -254,7 +254,8 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
     pose = fish_acts.fish_poses(rng, species, motion, rows, fish.size)
     camera = agent.draw_camera(rng, species, species.sensors[0], shape.fur, height_mm, 4)
     girth, wall_mm = np.full(len(rows), fish.size), np.full(len(rows), np.nan)
-    return motion, rows, pose, girth, None, species, camera, shape, wall_mm
+    views = camera[np.zeros(len(rows), np.int64)]
+    return motion, rows, pose, girth, species, views, shape, wall_mm
 
 
 def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
@@ -276,21 +277,14 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     # in some training recordings the walls are unknown
     if not scenario.novel and rng.random() >= 0.75:
         wall_mm = np.full(len(rows), np.nan)
-    walls = _walls(rng, middle, half)
-    return motion, rows, pose, girth, walls, species, camera, shape, wall_mm
-
-
-def _walls(rng: np.random.Generator, middle: Array, half: Array) -> Array:
-    """The wall nearest to each position (n, 2) mm, as columns (n, WALL_COLUMNS) of the renderer."""
-    walls = np.zeros((len(middle), _render_kernels.WALL_COLUMNS))
-    axis = np.argmin(half - np.abs(middle), axis=1)
-    rows = np.arange(len(middle))
-    walls[rows, axis] = np.where(middle[rows, axis] < 0, -1.0, 1.0)
-    walls[:, 2] = half[axis]
-    walls[:, 3] = rng.uniform(100.0, 300.0)
-    walls[:, 4] = rng.uniform(0.0, 8.0)
-    walls[:, 5] = rng.uniform(6.0, 20.0)
-    return walls
+    views = camera[np.zeros(len(rows), np.int64)]
+    # the wall nearest to the animal
+    axis, each = np.argmin(half - np.abs(middle), axis=1), np.arange(len(rows))
+    outward = np.zeros((len(rows), 2))
+    outward[each, axis] = np.where(middle[each, axis] < 0, -1.0, 1.0)
+    height, rounding, reach = rng.uniform([100.0, 0.0, 6.0], [300.0, 8.0, 20.0])
+    put_walls(views, outward, half[axis], height, rounding, reach)
+    return motion, rows, pose, girth, species, views, shape, wall_mm
 
 
 def _generator(animal: str) -> bytes:

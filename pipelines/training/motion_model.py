@@ -32,7 +32,7 @@ from liex_lab.geometry import SE3, so3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation import simulator
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.tracking import curve, trust
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.smoother import TrackingParameters, tunings_with
@@ -147,7 +147,7 @@ def other_builds(
         One per seed; [] if the animal's simulator has one build only, like the hand's.
     """
     world = simulator.world_of(Skeleton.load(animal))
-    if not isinstance(world, simulator.BodySimulator):
+    if world.skeleton.name == "hand":
         return []
     estimator = estimator_of(animal, "default", progress)
     plan = plan_of(animal)
@@ -159,7 +159,7 @@ def observed(
     estimator: PoseEstimator,
     plan: Plan,
     kind: str,
-    recording: TrueRecording,
+    recording: RenderedRecording,
     progress: Progress = silent,
 ) -> Measured:
     """Measure a rendered recording frame by frame; background and size are estimated as in a run.

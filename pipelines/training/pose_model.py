@@ -130,14 +130,11 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
         skeleton: the animal's skeleton.
     """
     world = simulator.world_of(skeleton)
-    if not (
-        isinstance(world, simulator.BodySimulator)
-        and isinstance(world.species, species.GenericSpecies)
-    ):
+    if not isinstance(world, species.GenericSpecies):
         return _OWN.get((skeleton.name, variant), RECIPES[variant])
     # sizes of a user's own animal, over its home length
     sizes = tuple(
-        (factor * skeleton.length, world.species.window_px(factor * skeleton.length))
+        (factor * skeleton.length, world.window_px(factor * skeleton.length))
         for factor in (1.0, 0.8, 1.0, 1.25)
     )
     sizes = sizes if variant == "default" else sizes[:1]

@@ -24,7 +24,7 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings import open_recording
 from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import verdict_in
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.recording import RenderedRecording
 from tests.campaign.commands import ENDED, run
 from tests.campaign.tally import Tally
 from tests.recordings.writers import STEP_NS, even_times, write_png_folder, write_tiff_stack
@@ -69,7 +69,7 @@ class Shown:
 def plain() -> Shown:
     """The mouse as a camera shows it usually."""
     with open_recording(_ADDRESS) as recording:
-        assert isinstance(recording, TrueRecording)
+        assert isinstance(recording, RenderedRecording)
         frames = np.round(recording.depths(0, len(recording))).astype(np.uint16)
         return Shown(frames, replace(recording.camera, source="stated"), recording.joints_camera)
 

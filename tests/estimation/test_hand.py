@@ -4,12 +4,12 @@ import numpy as np
 
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.scene.hand_segmenter import HandSegmenter
-from liex_lab.simulation.hand.simulator import HandSimulator
+from liex_lab.simulation.hand.simulator import HandSpecies
 
 
 def test_gestures_are_measured_from_the_pictures_alone() -> None:
     estimator = PoseEstimator.load("hand")
-    gestures = HandSimulator(estimator.skeleton).motion(3, 24)
+    gestures = HandSpecies(estimator.skeleton).motion(3, 24)
     scene, sample = HandSegmenter.learn(gestures, estimator.skeleton.view, 24)
     size = estimator.find_size(sample, scene)
     found = estimator.estimate(sample, scene, size)

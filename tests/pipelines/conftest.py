@@ -9,9 +9,9 @@ from liex_lab.pipelines.session import run_session
 
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session
-from liex_lab.simulation.locomotion import walking_session
-from liex_lab.simulation.recording import FRAME_NS, SyntheticSession
-from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.recording import FRAME_NS, RenderedRecording
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.species import MouseSpecies
 from tests.recordings.writers import START_NS, write_png_folder
 
 SPINE_MM = 65.0
@@ -24,12 +24,12 @@ TIMES_NS = [START_NS + FRAME_NS * int(k) for k in KEPT]
 
 
 @pytest.fixture(scope="session")
-def mouse() -> SyntheticSession:
-    return walking_session(9, N_RENDERED, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM)
+def mouse() -> RenderedRecording:
+    return MouseSpecies().motion(9, N_RENDERED, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=SPINE_MM)
 
 
 @pytest.fixture(scope="session")
-def images(mouse: SyntheticSession) -> np.ndarray:
+def images(mouse: RenderedRecording) -> np.ndarray:
     """The delivered depth images (n, H, W) uint16."""
     depths = mouse.depths(0, N_RENDERED)[KEPT].astype(np.uint16)
     depths[BLANK] = 0
@@ -38,7 +38,7 @@ def images(mouse: SyntheticSession) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def walk(
-    mouse: SyntheticSession, images: np.ndarray, tmp_path_factory: pytest.TempPathFactory
+    mouse: RenderedRecording, images: np.ndarray, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """The recording; tests copy it before they change it."""
     folder = tmp_path_factory.mktemp("recording") / "walk"

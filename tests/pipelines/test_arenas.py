@@ -21,7 +21,7 @@ from liex_lab.plan.sections import Region, SeveralArenas
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session, SessionWriter
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.catalogue import film
 from tests.pipelines.conftest import measure
 
@@ -31,7 +31,7 @@ DIGEST = "0123456789abcdef" * 4
 
 
 @cache
-def images(scene: str = "two-arenas") -> tuple[TrueRecording, np.ndarray]:
+def images(scene: str = "two-arenas") -> tuple[RenderedRecording, np.ndarray]:
     """A rendered scene, and its pictures."""
     made = film(scene, 1001, N_FRAMES)
     return made, made.depths(0, N_FRAMES)

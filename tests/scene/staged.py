@@ -12,10 +12,10 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.floor import Floor
-from liex_lab.simulation.locomotion import walking_session
-from liex_lab.simulation.recording import SyntheticSession
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scene import BOX, SimulatedScene
-from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.species import MouseSpecies
 
 CAMERA = PRIMESENSE_QVGA_SENSOR.camera
 
@@ -66,21 +66,23 @@ def stage(
     return replace(scene, still=still.astype(np.float32))
 
 
-def walk(scene: SimulatedScene, n_frames: int = 96, seed: int = 5, **more) -> SyntheticSession:
+def walk(scene: SimulatedScene, n_frames: int = 96, seed: int = 5, **more) -> RenderedRecording:
     """A mouse of 65 mm that walks on a stage."""
     with patch.object(SimulatedScene, "draw", staticmethod(lambda *_: scene)):
-        return walking_session(seed, n_frames, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=65.0, **more)
+        return MouseSpecies().motion(
+            seed, n_frames, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=65.0, **more
+        )
 
 
 @cache
-def walked(n_frames: int = 64) -> tuple[SyntheticSession, np.ndarray]:
+def walked(n_frames: int = 64) -> tuple[RenderedRecording, np.ndarray]:
     """A mouse that walks in a plain arena, and its depth images, rendered once."""
     mouse = walk(stage((170.0, 150.0), height_mm=700.0, room=False), n_frames)
     return mouse, mouse.depths(0, n_frames)
 
 
 @cache
-def on_a_table(n_frames: int = 24) -> tuple[SyntheticSession, np.ndarray]:
+def on_a_table(n_frames: int = 24) -> tuple[RenderedRecording, np.ndarray]:
     """The same in an arena on a table, with the floor of the room in view."""
     mouse = walk(stage(height_mm=700.0, raised_mm=480.0), n_frames)
     return mouse, mouse.depths(0, n_frames)

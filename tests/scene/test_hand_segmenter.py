@@ -19,7 +19,8 @@ from liex_lab.scene._blob_kernels import BLOCK
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import HandSegmenter, sight_rotations
 from liex_lab.scene.height_maps import view_of
-from liex_lab.simulation.hand.simulator import HandSession, HandSimulator
+from liex_lab.simulation.hand.simulator import HandSpecies
+from liex_lab.simulation.recording import RenderedRecording
 from tests.oracles.ends import ends_by_hand
 
 HAND = Skeleton.load("hand")
@@ -33,13 +34,13 @@ def scene_of(camera: Camera) -> HandSegmenter:
 
 
 @cache
-def people() -> tuple[HandSession, np.ndarray]:
+def people() -> tuple[RenderedRecording, np.ndarray]:
     """Independent pictures of one person's hand, and their depth."""
-    session = HandSimulator(HAND).test_split("clean", n_sessions=1)[0]
+    session = HandSpecies(HAND).test_split("clean", n_sessions=1)[0]
     return session, session.depths(0, 20)
 
 
-def joints_in_view(session: HandSession, crop_cameras: np.ndarray) -> np.ndarray:
+def joints_in_view(session: RenderedRecording, crop_cameras: np.ndarray) -> np.ndarray:
     T = view_of(crop_cameras)
     return (
         np.einsum("nij,nkj->nki", T.rotation, session.joints_camera[: len(crop_cameras)])

@@ -15,7 +15,7 @@ from tests.scene.staged import bare_floor
 from tests.scene.test_background_segmenter import SPINES, recording_of, tilted, with_box
 
 if TYPE_CHECKING:
-    from liex_lab.simulation.recording import TrueRecording
+    from liex_lab.simulation.recording import RenderedRecording
 
 
 BODY = ((80, 60), (12, 8))  # centre and half sides, pixels
@@ -88,7 +88,7 @@ def test_of_what_stands_still_in_a_noisy_picture_the_animal_is_what_changes(seed
     scene, sample = learn_scene(recording, SPINES)
     crops = scene.extract(sample, 1.0)
     assert crops.found.all()
-    true = cast("TrueRecording", recording).joints_arena
+    true = cast("RenderedRecording", recording).joints_arena
     off = scene.middles(crops)[:, :2] - true.mean(axis=1)[:, :2]
     assert np.linalg.norm(off, axis=1).max() < 20.0
 

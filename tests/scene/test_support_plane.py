@@ -69,7 +69,7 @@ def test_the_floor_is_where_the_mouse_walks(name):
 def test_an_arena_whose_floor_lies_a_little_above_the_bench_has_its_own_plane(tilt_deg):
     """The largest plane runs between the two, for they are less than a floor's flatness apart."""
     mouse = walk(stage(height_mm=700.0, raised_mm=6.0, wall_mm=60.0, tilt_deg=tilt_deg), N_FRAMES)
-    between = find_floor(np.asarray(mouse.scene.still), mouse.camera)
+    between = find_floor(np.asarray(mouse.stage.scene.still), mouse.camera)
     assert abs(between.distance_mm - mouse.floor.distance_mm) > 2.0
     scene, _ = learn_scene(mouse, SPINES, N_FRAMES)
     assert scene.floor.distance_mm == pytest.approx(mouse.floor.distance_mm, abs=1.2)
@@ -121,13 +121,13 @@ def test_where_nothing_moves_the_walled_ground_is_taken_and_said_to_be_in_doubt(
         return find_support_plane(scene)
 
     mouse = on_a_table()[0]
-    still = mouse.scene.still
+    still = mouse.stage.scene.still
     empty = np.tile(still, (6, 1, 1))
     found = stood_on(empty, still)
     assert found.floor.distance_mm == pytest.approx(700.0, abs=2.0)
     assert "no object of an animal's size moved" in found.doubt
     assert np.isnan(found.support)
-    low = replace(mouse.scene, still=np.where(still > 900.0, np.float32(0), still)).still
+    low = replace(mouse.stage.scene, still=np.where(still > 900.0, np.float32(0), still)).still
     ordinary = stood_on(np.tile(low, (6, 1, 1)), low)
     assert ordinary.region is None  # walls enclose the largest plane itself
 

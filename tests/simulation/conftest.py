@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import pytest
 
 from liex_lab.simulation import training_patches
-from liex_lab.simulation.hand import simulator
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -13,5 +12,4 @@ def small_blocks() -> Iterator[None]:
     """Blocks of 64 patches instead of 512; the seeds of blocks do not depend on it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training_patches, "BLOCK", 64)
-        patch.setattr(simulator, "BLOCK", 64)
         yield

@@ -8,8 +8,8 @@ import pytest
 from liex_lab.catalog import find_sample
 from liex_lab.optics.camera import KINECT_V2, PRIMESENSE_QVGA, Lens
 from liex_lab.recordings import open_recording
-from liex_lab.simulation.locomotion import walking_session
-from liex_lab.simulation.recording import SyntheticSession
+from liex_lab.simulation.recording import RenderedRecording
+from liex_lab.simulation.species import MouseSpecies
 from tests.recordings.asking import refusal
 
 ADDRESS = "synthetic:walk?seed=3&frames=6&sensor=primesense-qvga&spine_mm=70"
@@ -17,7 +17,7 @@ ADDRESS = "synthetic:walk?seed=3&frames=6&sensor=primesense-qvga&spine_mm=70"
 
 def test_an_address_says_seed_length_sensor_and_size() -> None:
     with open_recording(ADDRESS) as recording:
-        assert isinstance(recording, SyntheticSession)
+        assert isinstance(recording, RenderedRecording)
         assert (recording.name, recording.format, len(recording)) == (
             "synthetic-walk-3",
             "synthetic",
@@ -33,7 +33,9 @@ def test_an_address_says_seed_length_sensor_and_size() -> None:
 def test_every_setting_may_be_left_out() -> None:
     recording = open_recording("synthetic:walk")
     assert (len(recording), recording.camera) == (300, KINECT_V2)
-    np.testing.assert_array_equal(recording.frame(5).depth, walking_session(0, 300).frame(5).depth)
+    np.testing.assert_array_equal(
+        recording.frame(5).depth, MouseSpecies().motion(0, 300).frame(5).depth
+    )
 
 
 @pytest.mark.parametrize(
@@ -69,5 +71,5 @@ def test_a_stated_camera_changes_what_is_believed_and_not_the_pictures() -> None
 
 def test_any_animal_moves_that_a_toml_describes() -> None:
     snake = open_recording(f"synthetic:move?animal={find_sample('snake.toml')}&frames=2&seed=5")
-    assert isinstance(snake, SyntheticSession)
+    assert isinstance(snake, RenderedRecording)
     assert (snake.name, snake.skeleton.name, len(snake)) == ("synthetic-move-5", "snake", 2)

@@ -7,10 +7,9 @@ import pytest
 
 from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.simulation.locomotion import moving_session
 from liex_lab.simulation.pose_prior import FISH_KINDS, draw_bends
 from liex_lab.simulation.species import FishSpecies
-from liex_lab.simulation.training_patches import TrainingPatches, training_blocks
+from liex_lab.simulation.training_patches import TrainingPatches
 
 FISH = Skeleton.load("fish")
 
@@ -18,7 +17,7 @@ FISH = Skeleton.load("fish")
 @pytest.fixture(scope="module")
 def pictures() -> TrainingPatches:
     """Training windows of fish."""
-    return next(training_blocks(3, 1, FishSpecies(), window_px=272))[:16]
+    return next(FishSpecies().training_blocks(3, 1, window_px=272))[:16]
 
 
 def real_bends(reference_data: Path) -> np.ndarray:
@@ -85,7 +84,7 @@ def test_fish_hang_between_the_floor_and_the_nearest_that_the_camera_sees_whole(
 
 
 def test_a_swimming_fish_goes_head_first_and_stays_in_the_picture():
-    fish = moving_session(FishSpecies(), 6, 150)
+    fish = FishSpecies().motion(6, 150)
     uv = fish.camera.project(fish.joints_camera)
     assert ((uv > 0) & (uv < 1023)).all()
     middle = fish.joints_arena.mean(axis=1)

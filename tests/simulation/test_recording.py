@@ -8,16 +8,15 @@ from liex_lab.body.shape import Surface
 from liex_lab.body.variation import draw_shapes
 from liex_lab.errors import LiexError
 from liex_lab.runtime.processes import threads
-from liex_lab.simulation.hand.simulator import NYU_SENSOR
-from liex_lab.simulation.locomotion import walking_session
 from liex_lab.simulation.pose_prior import KINDS, sample_postures
-from liex_lab.simulation.recording import SEALED, SPLITS, SyntheticSession, split_of
-from liex_lab.simulation.simulator import BodySimulator, world_of
-from liex_lab.simulation.species import SENSORS, MouseSpecies
+from liex_lab.simulation.recording import SEALED, SPLITS, RenderedRecording, split_of
+from liex_lab.simulation.sensors import SENSORS
+from liex_lab.simulation.simulator import world_of
+from liex_lab.simulation.species import MouseSpecies
 from liex_lab.simulation.training_patches import PER_SESSION, TrainingPatches
 
 MOUSE = Skeleton.load("mouse")
-WORLD = BodySimulator(MouseSpecies(MOUSE))
+WORLD = MouseSpecies(MOUSE)
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +25,8 @@ def windows() -> TrainingPatches:
 
 
 @pytest.fixture(scope="module")
-def session() -> SyntheticSession:
-    return SyntheticSession.draw([5, 1], 12, sensor=SENSORS[1])
+def session() -> RenderedRecording:
+    return MouseSpecies().film([5, 1], 12, sensor=SENSORS[1])
 
 
 # postures
@@ -107,10 +106,10 @@ def test_blocks_depend_on_seed_and_number_alone_not_on_threads(windows: Training
 
 
 def test_a_session_is_a_recording_that_reads_the_same_in_any_order(
-    session: SyntheticSession,
+    session: RenderedRecording,
 ) -> None:
     late = session.frame(9).depth
-    again = SyntheticSession.draw([5, 1], 12, sensor=SENSORS[1])
+    again = MouseSpecies().film([5, 1], 12, sensor=SENSORS[1])
     np.testing.assert_array_equal(late, again.frame(9).depth)
     chunks = [frame for chunk in session.chunks(5) for frame in chunk]
     assert [frame.index for frame in chunks] == list(range(12))
@@ -120,7 +119,7 @@ def test_a_session_is_a_recording_that_reads_the_same_in_any_order(
     assert np.all(np.diff(session.times_ns) > 0)
 
 
-def test_the_animal_and_the_floor_are_where_the_truth_says(session: SyntheticSession) -> None:
+def test_the_animal_and_the_floor_are_where_the_truth_says(session: RenderedRecording) -> None:
     T = session.T_arena_camera
     np.testing.assert_allclose(T @ session.joints_camera, session.joints_arena, atol=1e-6)
     np.testing.assert_allclose(session.floor.T_arena_camera.rotation, T.rotation, atol=1e-9)
@@ -131,7 +130,7 @@ def test_the_animal_and_the_floor_are_where_the_truth_says(session: SyntheticSes
         read = frame.depth[r - 1 : r + 2, c - 1 : c + 2]
         hits += bool((np.abs(read[read > 0] - session.joints_camera[i, 1, 2] + 14) < 14).any())
     assert hits >= 11
-    centre = T.inverse() @ [*session.scene.centre, 0.0]
+    centre = T.inverse() @ [*session.stage.scene.centre, 0.0]
     c, r = np.round(session.camera.project(centre)).astype(int)
     patch = (slice(r - 15, r + 15), slice(c - 15, c + 15))
     plane = session.floor.depth(session.width, session.height)
@@ -140,21 +139,22 @@ def test_the_animal_and_the_floor_are_where_the_truth_says(session: SyntheticSes
 
 def test_splits_are_fixed_halved_between_sensors_and_apart() -> None:
     clean, hard = (WORLD.test_split(name, n_sessions=2) for name in ("clean", "hard"))
-    first = SyntheticSession.draw([71_001, 0], sensor=SENSORS[0], name="clean-00")
+    first = MouseSpecies().film([71_001, 0], sensor=SENSORS[0])
     np.testing.assert_array_equal(clean[0].depths(0, 1), first.depths(0, 1))
     assert [(s.width, len(s)) for s in clean + hard] == 2 * [(640, 50), (512, 50)]
-    assert not any(s.contents.shown.any() for s in clean)
-    assert 0.3 < np.mean([s.contents.shown.mean() for s in hard]) < 0.65
+    assert not any((s.stage.objects[0].moment >= 0).any() for s in clean)
+    assert 0.3 < np.mean([s.stage.objects[0].moment >= 0 for s in hard]) < 0.65
     assert len({s.spine_mm for s in clean + hard}) == 4
     assert WORLD.test_split("clean", spine_mm=80.0, n_sessions=1)[0].spine_mm == 80.0
     with pytest.raises(LiexError, match="known are clean, hard, other-body, other-camera"):
         WORLD.test_split("easy")
     assert [split_of(SEALED, k) for k in range(5)] == [*SPLITS, "clean"]
     for s in hard:  # another object never touches the animal in the image
-        for i in np.flatnonzero(s.contents.shown)[:6]:
-            item = s.camera.project(s.T_arena_camera.inverse() @ s.contents.objects[i])
+        (item,) = s.stage.objects
+        for i in np.flatnonzero(item.moment >= 0)[:6]:
+            mesh = s.camera.project(s.T_arena_camera.inverse() @ item.vertices()[i])
             body = s.camera.project(s.joints_camera[i])
-            assert np.linalg.norm(item[:, None] - body, axis=-1).min() > 4.0
+            assert np.linalg.norm(mesh[:, None] - body, axis=-1).min() > 4.0
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,7 @@ def test_splits_are_fixed_halved_between_sensors_and_apart() -> None:
 )
 def test_other_cameras_have_a_focal_length_outside_the_training(animal: str) -> None:
     world = world_of(Skeleton.load(animal))
-    sensors = world.species.sensors if isinstance(world, BodySimulator) else (NYU_SENSOR, *SENSORS)
+    sensors = world.sensors
     others = {r.camera.fx for r in world.test_split("other-camera", n_sessions=2)}
     for whole in others:
         for sensor in sensors:  # training varies the focal length by 3 %
@@ -171,11 +171,11 @@ def test_other_cameras_have_a_focal_length_outside_the_training(animal: str) -> 
 
 
 def test_a_walk_is_continuous_and_shows_every_kind_of_posture() -> None:
-    s = walking_session(4, 450)
+    s = MouseSpecies().motion(4, 450)
     speed = np.linalg.norm(np.diff(s.joints_arena, axis=0), axis=-1) * s.rate_hz
     assert speed.max() < 600.0
     assert np.linalg.norm(np.ptp(s.joints_arena[:, 0], axis=0)) > s.spine_mm
     assert s.joints_arena[:, 4, 2].max() > 0.7 * s.spine_mm  # it rears
-    assert (s.scene.wall_clearance(s.joints_arena[..., :2]) > 0).all()
+    assert (s.stage.scene.wall_clearance(s.joints_arena[..., :2]) > 0).all()
     uv = s.camera.project(s.joints_camera)
     assert ((uv > 0) & (uv < [s.width - 1, s.height - 1])).all()

@@ -5,22 +5,22 @@ import pytest
 
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import open_recording
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
-from liex_lab.simulation.scenes.stage import SceneRecording, timing_of
-from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.scenes.stage import timing_of
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
 
 SEED = 41
 N = 12
 
 
-def mice(name: str, n_frames: int = N, **settings: float) -> SceneRecording:
+def mice(name: str, n_frames: int = N, **settings: float) -> RenderedRecording:
     made = film(name, SEED, n_frames, sensor=PRIMESENSE_QVGA_SENSOR, **settings)  # type: ignore[arg-type]
-    assert isinstance(made, SceneRecording)
+    assert isinstance(made, RenderedRecording)
     return made
 
 
-def heights(recording: TrueRecording, frame: int) -> np.ndarray:
+def heights(recording: RenderedRecording, frame: int) -> np.ndarray:
     """Height of every pixel above the true floor, mm; NaN where unread."""
     depth = recording.depths(frame, frame + 1)[0].astype(float)
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
@@ -92,6 +92,7 @@ def test_cameras_and_arenas_are_as_their_scenes_say() -> None:
 def test_bedding_changes_where_the_animal_walks_and_lifts_it() -> None:
     recording = mice("bedding", 36)
     stills = recording.stage.stills
+    assert stills is not None
     assert len(stills) == 3
     changed = np.abs(stills[-1] - stills[0])
     assert 0.0 < (changed > 2.0).mean() < 0.3
@@ -114,7 +115,7 @@ def test_a_mouse_in_its_house_is_hidden() -> None:
 
 def test_a_tether_reaches_from_the_head_to_the_commutator() -> None:
     recording = mice("tether")
-    cable = recording.stage.moving[1].mesh.vertices
+    cable = recording.stage.objects[1].vertices()
     head = recording.joints_arena[:, -2:].mean(axis=1)
     assert (np.linalg.norm(cable[:, 0] - head, axis=-1) < 30.0).all()
     np.testing.assert_allclose(cable[:, -1], np.broadcast_to(cable[0, -1], (N, 3)), atol=12.0)
@@ -175,7 +176,7 @@ def test_a_mirrored_hand_is_the_hand_with_left_and_right_exchanged() -> None:
 def test_a_scene_is_a_recording_by_its_address() -> None:
     address = f"synthetic:scene?name=raised&seed={SEED}&frames=3&sensor=primesense-qvga"
     recording = open_recording(address)
-    assert isinstance(recording, TrueRecording)
+    assert isinstance(recording, RenderedRecording)
     assert (recording.name, len(recording)) == (f"scene-raised-{SEED}", 3)
     np.testing.assert_array_equal(recording.frame(1).depth, mice("raised", 3).depths(1, 2)[0])
     with pytest.raises(RecordingError, match="there is no scene 'moon'"):

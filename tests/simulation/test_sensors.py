@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from liex_lab.simulation import _sensor_kernels as k
-from liex_lab.simulation.species import (
+from liex_lab.simulation.sensors import (
     KINECT_V2_SENSOR,
     PRIMESENSE_SENSOR,
     RAYTRIX_R5_SENSOR,

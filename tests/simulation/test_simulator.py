@@ -11,9 +11,7 @@ from liex_lab.catalog import find_sample
 from liex_lab.runtime.processes import threads
 from liex_lab.scene.learning import learn_scene
 from liex_lab.simulation import training_patches
-from liex_lab.simulation.locomotion import moving_session
-from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.simulator import BodySimulator, world_of
+from liex_lab.simulation.simulator import world_of
 from liex_lab.simulation.species import GenericSpecies
 
 SNAKE = Skeleton.load(find_sample("snake.toml"))
@@ -92,9 +90,8 @@ def test_a_window_holds_the_animal_wherever_it_is(monkeypatch):
     monkeypatch.setattr(training_patches, "BLOCK", 32)
     for skeleton in (SNAKE, STAR):
         world = world_of(skeleton)
-        assert isinstance(world, BodySimulator)
-        assert isinstance(world.species, GenericSpecies)
-        (block,) = world.training_blocks(11, 1, window_px=world.species.window_px(skeleton.length))
+        assert isinstance(world, GenericSpecies)
+        (block,) = world.training_blocks(11, 1, window_px=world.window_px(skeleton.length))
         uv = block.joints_mm[..., :2] / block.joints_mm[..., 2:] * block.intrinsics[:, None, :2]
         uv = uv + block.intrinsics[:, None, 2:] - block.origin[:, None]
         assert (uv > 0).all()
@@ -102,7 +99,7 @@ def test_a_window_holds_the_animal_wherever_it_is(monkeypatch):
 
 
 def test_an_unknown_animal_moves_smoothly_over_the_floor():
-    recording = moving_session(GenericSpecies.of(SNAKE), 12, 120)
+    recording = GenericSpecies.of(SNAKE).motion(12, 120)
     step = np.linalg.norm(np.diff(recording.joints_arena, axis=0), axis=-1)
     assert step.max() < 0.15 * recording.spine_mm
     assert step.mean() > 0.1
@@ -112,10 +109,9 @@ def test_an_unknown_animal_moves_smoothly_over_the_floor():
 @pytest.mark.nightly
 @pytest.mark.parametrize("animal", ["fish", "snake"])
 def test_the_scene_of_a_rendered_recording_is_learned_and_the_animal_found_in_it(animal):
-    world = world_of(SNAKE if animal == "snake" else Skeleton.load(animal))
-    assert isinstance(world, BodySimulator)
-    skeleton, species = world.skeleton, world.species
-    recording = SyntheticSession.draw([13, 2], 20, species=species)
+    species = world_of(SNAKE if animal == "snake" else Skeleton.load(animal))
+    skeleton = species.skeleton
+    recording = species.film([13, 2], 20)
     spans = (0.6 * skeleton.length, 1.5 * skeleton.length)
     scene, sample = learn_scene(recording, spans, 20, skeleton.view.min_height_mm, skeleton.view)
     assert scene.stride == (2 if animal == "fish" else 1)

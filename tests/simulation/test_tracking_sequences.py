@@ -11,21 +11,22 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import open_recording
 from liex_lab.simulation.corruptions import EVENTS, draw_script
-from liex_lab.simulation.simulator import SEQUENCES, TestSequence, tracking_sequence, world_of
+from liex_lab.simulation.recording import RenderedRecording
+from liex_lab.simulation.simulator import SEQUENCES, tracking_sequence, world_of
 
 STEP_NS = 33_333_333
 
 
 @pytest.fixture(scope="module")
-def hard() -> TestSequence:
+def hard() -> RenderedRecording:
     return tracking_sequence(world_of(Skeleton.load("mouse")), "hard", seed=3)
 
 
-def spans(sequence: TestSequence, kind: str) -> list[slice]:
+def spans(sequence: RenderedRecording, kind: str) -> list[slice]:
     return [slice(event.start, event.stop) for event in sequence.events if event.kind == kind]
 
 
-def beside(sequence: TestSequence, frame: int, radius_mm: float) -> np.ndarray:
+def beside(sequence: RenderedRecording, frame: int, radius_mm: float) -> np.ndarray:
     """The readings around the animal's middle."""
     depth = sequence.frame(frame).depth
     middle = sequence.joints_camera[frame].mean(axis=0)
@@ -78,7 +79,7 @@ def test_holes_are_unread_and_an_occluder_is_nearer_than_the_animal(hard):
 
 def test_sequences_are_recordings_by_address_and_the_same_every_time(hard):
     again = open_recording("synthetic:track-hard?animal=mouse&seed=3&frames=20")
-    assert isinstance(again, TestSequence)
+    assert isinstance(again, RenderedRecording)
     assert len(again) == 20
     fixed = open_recording("synthetic:track-easy?frames=3")
     assert fixed.name == "track-easy-mouse-75001"

@@ -13,7 +13,7 @@ from liex_lab.geometry import SE3
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.scene.hand_segmenter import HandSegmenter
 from liex_lab.scene.height_maps import view_of
-from liex_lab.simulation.hand.simulator import HandSimulator
+from liex_lab.simulation.hand.simulator import HandSpecies
 from liex_lab.tracking.particles import ParticleFilter, ProcessNoise
 from tests.estimation.toy import CAMERA, FLOOR, SCENE, Toy, toy_mice, trained
 
@@ -67,7 +67,7 @@ def test_the_metric_of_a_hand_sees_what_it_has_learned_from():
     hand was lost within some frames.
     """
     hand = PoseEstimator.load("hand")
-    gestures = HandSimulator(hand.skeleton).motion(3, 12)
+    gestures = HandSpecies(hand.skeleton).motion(3, 12)
     scene, sample = HandSegmenter.learn(gestures, hand.skeleton.view, 12)
     size = hand.find_size(sample, scene)
     particles = ParticleFilter(hand, scene, size, np.random.default_rng(0), FEW)

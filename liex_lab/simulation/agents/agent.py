@@ -17,11 +17,12 @@ from scipy.signal import lfilter, lfilter_zi
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, Surface
 from liex_lab.scene.height_maps import Patches
-from liex_lab.simulation._render_kernels import WALL_COLUMNS, part_of
 from liex_lab.simulation._sensor_kernels import ANIMAL, UNIT
+from liex_lab.simulation.rendering import Solid, Views
 from liex_lab.simulation.scene import draw_views
-from liex_lab.simulation.species import Sensor, Species
-from liex_lab.simulation.training_patches import Views
+from liex_lab.simulation.sensors import Sensor
+from liex_lab.simulation.species import Species
+from liex_lab.simulation.training_patches import floor_views
 
 Array = NDArray[np.float64]
 
@@ -309,26 +310,24 @@ def draw_camera(
     """
     camera = sensor.camera.every(stride)
     focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
-    place = replace(
-        draw_views(rng, 1, species.setting), translation=np.array([[0.0, 0.0, height_mm]])
-    )
+    place = draw_views(rng, 1, species.setting)
+    place.translation[:] = [0.0, 0.0, height_mm]
     parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))
     size_px = np.array([[camera.width, camera.height]])
     error = rng.standard_normal((1, 3)) * [0.002, 0.002, 0.5 * species.setting.scale]
     middle = np.array([camera.cx, camera.cy]) + size_px[0] / 2.0
     intrinsics = np.concatenate([focal, middle])[None]
     whole = size_px + (2 * (size_px / 2.0)).astype(np.int64)
-    return Views(intrinsics, whole, place, parameters, np.zeros(1), error)
+    return floor_views(intrinsics, whole, place, parameters, error)
 
 
 def render_agent(
     rng: np.random.Generator,
     species: Species,
-    camera: Views,
+    views: Views,
     shape: Body,
     pose: Pose,
     girth: Array,
-    walls: Array | None,
     window_px: int,
 ) -> Iterator[Patches]:
     """Patches around an animal in given poses, 256 frames at a time.
@@ -336,11 +335,10 @@ def render_agent(
     Args:
         rng: random number generator for the noise and the tail.
         species: the species.
-        camera: the camera, a batch of one.
+        views: the camera and the wall in each frame (n).
         shape: its body, a batch of which the first is used.
         pose: (n) arena frame.
         girth: (n,) factor of all lengths across the body.
-        walls: (n, WALL_COLUMNS) the wall in each frame; None for no walls.
         window_px: side of the patches, px.
 
     Yields:
@@ -350,26 +348,22 @@ def render_agent(
     n = len(girth)
     seeds = rng.integers(1, 2**63, n).astype(np.uint64)
     bends = species.bends(rng, 1)
-    walls = np.zeros((n, WALL_COLUMNS)) if walls is None else walls
     for start in range(0, n, _BLOCK):
         part = slice(start, min(start + _BLOCK, n))
         one = np.zeros(part.stop - start, np.int64)
-        views = camera[one]
         lying = None if bends is None else bends[one]
         vertices = surface.vertices(pose[part], shape[one], girth[part], lying)
-        origin, depth, background = views.patches(
-            (part_of(vertices, surface.faces, ANIMAL),),
-            vertices[:, : surface.n_trunk_vertices],
-            walls[part],
-            seeds[part],
-            window_px,
-        )
-        unit = np.float32(camera.parameters[0, UNIT])
+        body = Solid.of(vertices, surface.faces, label=ANIMAL)
+        some = views[part]
+        origin = some.around(vertices[:, : surface.n_trunk_vertices], window_px)
+        size = (window_px, window_px)
+        depth, background = some.render([body], seeds[part], origin, size, learn=True)
+        unit = np.float32(some.parameters[0, UNIT])
         yield Patches(
             depth * unit,
             background * unit,
-            views.intrinsics,
+            some.intrinsics,
             origin.astype(float),
-            views.floor,
+            some.floor,
             species.skeleton.view,
         )

@@ -9,16 +9,17 @@ available.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body._skinning_kernels import CAPSULE_RINGS, CAPSULE_SEGMENTS, joined_faces
 from liex_lab.body.pose import Pose
+from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.body.variation import N_ARM_CAPSULES, HandShape, arm_vertices, draw_hands, forearms
 from liex_lab.errors import LiexError
@@ -30,31 +31,18 @@ from liex_lab.recordings.formats.images.nyu import (
     NyuReference,
     fit_hands,
 )
-from liex_lab.runtime.memory import Rows
-from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import sight_rotations
 from liex_lab.simulation import _render_kernels as kernels
-from liex_lab.simulation._render_kernels import PatchCamera, SensorNoise, part_of
-from liex_lab.simulation._sensor_kernels import (
-    ANIMAL,
-    N_PARAMETERS,
-    NORMAL,
-    OBJECT,
-    PRIMESENSE_KIND,
-)
+from liex_lab.simulation import training_patches
+from liex_lab.simulation._sensor_kernels import ANIMAL, PRIMESENSE_KIND
 from liex_lab.simulation.hand.postures import draw_postures, draw_turns
-from liex_lab.simulation.pose_prior import SIZE_RANGE
-from liex_lab.simulation.recording import (
-    FRAME_NS,
-    OTHER_CAMERA,
-    TrueRecording,
-    planned,
-    whole_images,
-)
-from liex_lab.simulation.scene import PART_FACES, SPHERE_TUBE, rounded
-from liex_lab.simulation.species import KINECT_V2_SENSOR, Sensor, unseen
-from liex_lab.simulation.training_patches import BLOCK, PER_SESSION, TrainingPatches, degrade
+from liex_lab.simulation.recording import OTHER_CAMERA, Actor, Split, Stage
+from liex_lab.simulation.rendering import Solid, Views, inverse_depth
+from liex_lab.simulation.scene import BOX, SPHERE_TUBE, SimulatedScene, rounded
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor, draw_units, unseen
+from liex_lab.simulation.species import Species
+from liex_lab.simulation.training_patches import TrainingPatches
 
 Array = NDArray[np.float64]
 
@@ -151,60 +139,32 @@ BODY_FACES = joined_faces([SPHERE_TUBE] * 3)
 
 
 @dataclass(frozen=True)
-class HandFrameContents(Rows):
-    """Hands, n of them, and their surroundings, in the camera frame.
+class Hand(Actor):
+    """A person's hand in n frames, with bones of its own, and its arm.
 
     Attributes:
-        pose: (n) of the hands.
-        joints: (n, J, 3) mm.
-        spine_mm: (n,) lengths of the hands, mm.
-        hand: (n, V, 3) meshes of the hands, mm.
-        arm: (n, A, 3) meshes of the arms, mm.
-        body: (n, B, 3) meshes of torso, head and another object, mm.
-        objects: (n, W, 3) meshes of the distractors, mm.
-        shown: (n,) bool, whether the distractor is present.
-        wall: (n, 4) planes behind the scene and their unevenness, as in `kernels.draw_hands`.
-        parameters: (n, N_PARAMETERS) of the sensors.
-        seeds: (n,) uint64 of their noise.
-        faces: (F, 3) int32, triangles of the hands' meshes.
-        object_faces: (G, 3) int32, triangles of the distractors' meshes.
+        own_joints: (n, J, 3) mm, arena frame.
+        hand: (n, V, 3) vertices of the hand, mm, arena frame.
+        arm: (n, A, 3) vertices of the arm, mm, arena frame.
     """
 
-    SHARED = ("faces", "object_faces")
-    pose: Pose
-    joints: Array
-    spine_mm: Array
+    SHARED: ClassVar[tuple[str, ...]] = ()
+    body: HandShape
+    own_joints: Array
     hand: Array
     arm: Array
-    body: Array
-    objects: Array
-    shown: NDArray[np.bool_]
-    wall: Array
-    parameters: Array
-    seeds: NDArray[np.uint64]
-    faces: NDArray[np.int32]
-    object_faces: NDArray[np.int32] = field(default_factory=lambda: PART_FACES)
 
-    def images(self, cameras: PatchCamera, shape: tuple[int, int]) -> NDArray[np.uint16]:
-        """Render depth images.
+    @property
+    def joints(self) -> Array:
+        """The person's own joints (n, J, 3) mm, arena frame."""
+        return self.own_joints
 
-        Args:
-            cameras: of the n images.
-            shape: rows and columns of the rendered part.
-
-        Returns:
-            (n, *shape) uint16 mm, 0 if unread.
-        """
-        parts = (
-            part_of(self.body, BODY_FACES, OBJECT),
-            part_of(self.objects, self.object_faces, OBJECT, self.shown),
-            part_of(self.arm, ARM_FACES, ANIMAL),
-            part_of(self.hand, self.faces, ANIMAL),
-        )
-        noises = SensorNoise(self.parameters, self.seeds, NORMAL)
-        out = np.empty((len(self.seeds), *shape), np.uint16)
-        in_parallel(kernels.draw_hands, len(out), parts, self.wall, cameras, noises, out)
-        return out
+    @property
+    def solids(self) -> tuple[Solid, ...]:
+        """The hand and the arm."""
+        faces = self.body.flesh.faces, ARM_FACES
+        meshes = zip((self.hand, self.arm), faces, strict=True)
+        return tuple(Solid.of(*mesh, self.present, ANIMAL) for mesh in meshes)
 
 
 def pose_hands(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pose:
@@ -224,7 +184,11 @@ def pose_hands(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pos
 
 
 def draw_places(
-    rng: np.random.Generator, intrinsics: Array, size_px: Array, low: Array, high: Array
+    rng: np.random.Generator,
+    intrinsics: Array,
+    size_px: NDArray[np.int64],
+    low: Array,
+    high: Array,
 ) -> Array:
     """Points between two depths and inside their images, uniform in the image.
 
@@ -247,60 +211,67 @@ def draw_places(
     return np.concatenate([xy, depth[:, None]], axis=1)
 
 
-def assemble(
+def surround(
     rng: np.random.Generator,
-    skeleton: Skeleton,
     pose: Pose,
     shape: HandShape,
-    size: Array,
     intrinsics: Array,
-    parameters: Array,
     object_share: float,
     scenery: int,
-    wrists: Array | None = None,
-) -> HandFrameContents:
-    """Hands with their arms, bodies, walls and distractors.
+    wrists: Array | None,
+    surface: Surface,
+    T_arena_camera: SE3,
+) -> tuple[Hand, tuple[Solid, ...], Array]:
+    """Hands with their arms, and bodies, objects and walls around them.
 
     Args:
         rng: random number generator.
-        skeleton: of the hand.
         pose: (n) camera frame.
         shape: (n) the people's hands.
-        size: (n,) over home size.
         intrinsics: (n, 4) fx, fy, cx, cy, px.
-        parameters: (n, N_PARAMETERS) of the sensors.
-        object_share: share of images with a distractor next to the hand.
+        object_share: share of images with an object next to the hand.
         scenery: number of consecutive images that share body and wall.
         wrists: (n, 3) wrist rotations, rad; None draws one for every image.
+        surface: the skeleton and its mesh model.
+        T_arena_camera: the camera's pose.
 
     Returns:
-        The contents of n images.
+        The hands and the objects, and the walls (n, N_GROUND) behind them.
     """
-    n = len(size)
+    skeleton, size, n = surface.skeleton, pose.scale, len(pose.scale)
     rotations, positions = shape.joints(skeleton, pose)
-    hand = shape.flesh.vertices(rotations, positions, pose.scale, pose.scale)
+    hand = shape.flesh.vertices(rotations, positions, size, size)
     each = np.arange(n) // scenery
     n_scenes = int(each[-1]) + 1
-    frame, elbow = forearms(rng, rotations, positions, pose.scale, wrists)
+    frame, elbow = forearms(rng, rotations, positions, size, wrists)
     body, shoulder = _bodies(positions, elbow, frame[:, :, 0], rng.random((n_scenes, 3, 8))[each])
-    arm = arm_vertices(frame, elbow, shoulder, pose.scale, shape.arm)
-    item, shown = _objects(rng, hand, object_share)
-    wall = _walls(rng, n_scenes, intrinsics[::scenery][:n_scenes], hand, body)[each]
-    seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-    return HandFrameContents(
-        pose,
-        positions,
-        size * skeleton.length,
-        hand,
-        arm,
-        body,
-        item,
-        shown,
-        wall,
-        parameters,
-        seeds,
-        shape.flesh.faces,
+    arm = arm_vertices(frame, elbow, shoulder, size, shape.arm)
+
+    def depth(hands: Array) -> tuple[Array, Array]:
+        """About that of the hand; farther away an object needs more room not to be behind it."""
+        middle = hands[..., 2].mean(axis=1)
+        z = np.maximum(middle + rng.uniform(-30.0, 160.0, n), 300.0)
+        return z, np.maximum(z, middle) / middle
+
+    radii = rng.uniform(15.0, 60.0, (n, 3))
+    item = training_patches.neighbours(rng, hand, radii, (10.0, 80.0), depth, 8.0, object_share)
+    walls = _walls(rng, n_scenes, intrinsics[::scenery][:n_scenes], hand, body)[each]
+    T, there = T_arena_camera, np.ones(n, np.bool_)
+    actor = Hand(
+        surface,
+        float(size[0] * skeleton.length),
+        shape,
+        pose.moved(T),
+        size,
+        None,
+        there,
+        T @ positions,
+        T @ hand,
+        T @ arm,
     )
+    mesh = item.vertices()
+    objects = Solid.of(T @ body, BODY_FACES), replace(item, mesh=(T @ mesh).__getitem__)
+    return actor, objects, walls
 
 
 def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
@@ -341,118 +312,32 @@ def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Arra
     ).reshape(n, -1, 3), shoulder
 
 
-def _objects(
-    rng: np.random.Generator, hand: Array, share: float
-) -> tuple[Array, NDArray[np.bool_]]:
-    """A block or ball (n, V, 3) mm next to each hand at about its depth, and its presence (n,)."""
-    n = len(hand)
-    radii = rng.uniform(15.0, 60.0, (n, 3))
-    direction = rng.uniform(-np.pi, np.pi, n)
-    toward = np.stack([np.cos(direction), np.sin(direction)], axis=-1)
-    reach = np.einsum("nvk,nk->nv", hand[..., :2], toward).max(axis=1)
-    middle = hand.mean(axis=1)
-    clear = reach - np.sum(middle[:, :2] * toward, axis=1) + np.hypot(radii[:, 0], radii[:, 1])
-    offset = (clear + rng.uniform(10.0, 80.0, n))[:, None] * toward
-    depth = np.maximum(middle[:, 2] + rng.uniform(-30.0, 160.0, n), 300.0)
-    # an object farther away needs a larger offset to appear next to the hand, not behind it
-    centre = np.column_stack(
-        [
-            (middle[:, :2] + offset) * (np.maximum(depth, middle[:, 2]) / middle[:, 2])[:, None],
-            depth,
-        ]
-    )
-    power = np.where(rng.random(n) < 0.5, 2.0, 8.0)
-    return rounded(centre, radii, rng.uniform(-np.pi, np.pi, n), power), rng.random(n) < share
-
-
 def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, body: Array) -> Array:
-    """A randomly sloped plane (m, 4) behind everything; out of range in a fifth of the scenes."""
+    """A randomly sloped plane behind everything (m, N_GROUND); in four fifths of the scenes."""
     farthest = max(float(hand[..., 2].max()), float(np.quantile(body[..., 2], 0.9)))
     distance = np.minimum(farthest, 2000.0) + rng.uniform(150.0, 1500.0, m)
-    slope = rng.normal(0.0, 0.25, (m, 2))
-    a, b = (slope[:, k] / intrinsics[:, k] / distance for k in range(2))
-    c = 1.0 / distance - a * intrinsics[:, 2] - b * intrinsics[:, 3]
-    wall = np.stack([a, b, c, rng.uniform(0.0, 6.0, m)], axis=1)
-    wall[rng.random(m) < 0.2, :3] = 0.0
-    return wall
+    normal = np.column_stack([rng.normal(0.0, 0.25, (m, 2)), np.ones(m)])
+    walls = np.zeros((m, kernels.N_GROUND))
+    walls[:, kernels.FLOOR] = inverse_depth(normal, distance, intrinsics)
+    walls[:, kernels.HEIGHT] = distance
+    walls[:, kernels.ROUGH] = rng.uniform(0.0, 6.0, m)
+    walls[rng.random(m) < 0.2, kernels.FLOOR] = 0.0
+    return walls
 
 
 NYU_SENSOR = Sensor("NYU Kinect", LABEL_CAMERA, PRIMESENSE_KIND)
-# name: (own seed, shape family, noise, eroded pixels, share of frames with another object next to
-# the hand)
-SPLITS = {
+SPLITS: Mapping[str, Split] = {
     "clean": (81_001, "train", 1.0, 0, 0.0),
     "hard": (82_001, "train", 2.0, 1, 0.5),
     "other-body": (84_001, "other", 1.0, 0, 0.0),
     OTHER_CAMERA: (85_001, "train", 1.0, 0, 0.0),
 }
-_SEALED_SEED = 980_413  # of the held-out split, see `recording.SEALED`
-# training images: (sensor, sensor pixels per image pixel, nearest and farthest hand, share)
+# training images: (sensor, nearest and farthest hand, share)
 _KINDS = (
-    (NYU_SENSOR, 1, 620.0, 1200.0, 0.55),
-    (NYU_SENSOR, 2, 400.0, 700.0, 0.20),
-    (KINECT_V2_SENSOR, 1, 400.0, 1000.0, 0.25),
+    (NYU_SENSOR, 620.0, 1200.0, 0.55),
+    (replace(NYU_SENSOR, stride=2), 400.0, 700.0, 0.20),
+    (KINECT_V2_SENSOR, 400.0, 1000.0, 0.25),
 )
-
-
-class HandSession(TrueRecording):
-    """A virtual recording of one person's hand; the joints are the person's own.
-
-    It has no floor: a plane perpendicular to the optical axis, at 1300 mm, replaces it and defines
-    the arena frame.
-
-    Attributes:
-        sensor: the camera's make.
-        contents: the hand and its surroundings, n frames.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        skeleton: Skeleton,
-        sensor: Sensor,
-        contents: HandFrameContents,
-        times_ns: NDArray[np.int64] | None = None,
-    ) -> None:
-        """A recording of given contents.
-
-        Args:
-            name: of the recording.
-            skeleton: of the hand.
-            sensor: the camera's make.
-            contents: the hand and its surroundings, n frames, camera frame.
-            times_ns: (n,) int64 time stamps, ns; None counts steps of `FRAME_NS`.
-        """
-        times = np.arange(len(contents.seeds)) * FRAME_NS if times_ns is None else times_ns
-        floor = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1300.0, sensor.camera)
-        super().__init__(
-            name,
-            sensor.camera,
-            times,
-            skeleton=skeleton,
-            spine_mm=float(contents.spine_mm[0]),
-            pose=contents.pose,
-            T_arena_camera=floor.T_arena_camera,
-            floor=floor,
-            joints_camera=contents.joints,
-        )
-        self.sensor = sensor
-        self.contents = contents
-
-    def depths(self, start: int, stop: int) -> NDArray[np.float32]:
-        """Depth images of a range of frames, rendered on all threads.
-
-        Args:
-            start: first frame.
-            stop: one past the last frame.
-
-        Returns:
-            (stop - start, H, W) float32 mm, 0 if unread.
-        """
-        c = self.sensor.camera
-        cameras = whole_images(c, stop - start)
-        some = self.contents[start:stop]
-        return some.images(cameras, (c.height, c.width)).astype(np.float32)
 
 
 # angles, T_view_palm, places and wrist rotations of n hands, see `draw_gestures`
@@ -460,21 +345,25 @@ _Acted = tuple[Array, Array, Array, Array | None]
 
 
 @dataclass(frozen=True)
-class HandSimulator:
-    """Simulator of a right hand in front of a depth camera.
+class HandSpecies(Species):
+    """A right hand in front of a depth camera; the joints are the person's own.
+
+    Its recordings have no floor: a plane perpendicular to the optical axis, at 1300 mm, replaces it
+    and defines the arena frame.
 
     Attributes:
-        skeleton: of the hand.
         reference: folder with labelled hands for the test postures; None draws them as those of
             the training images.
-        splits: names of the test splits.
-        sources: source of the training images, one phrase.
     """
 
-    skeleton: Skeleton
+    skeleton: Skeleton = field(default_factory=lambda: Skeleton.load("hand"))
+    sensors: tuple[Sensor, ...] = (NYU_SENSOR,)
+    floats: bool = True
     reference: Path | None = None
-    splits: tuple[str, ...] = tuple(SPLITS)
-    sources: str = (
+    splits: ClassVar[Mapping[str, Split]] = SPLITS
+    sealed_seed: ClassVar[int] = 980_413
+    patch_px: ClassVar[int] = 320
+    sources: ClassVar[str] = (
         "rendered from a seed; bones and postures from published anatomy; no depth image and no "
         "label of a real hand was used"
     )
@@ -498,130 +387,120 @@ class HandSimulator:
             else f"fitted to the labels of the NYU test frames from {N_FIRST_PERSON + 1} on"
         )
 
-    def training_blocks(
+    @property
+    def other_sensors(self) -> tuple[Sensor, ...]:
+        """Cameras that are not used in training."""
+        return unseen((NYU_SENSOR, KINECT_V2_SENSOR))
+
+    def _block(
         self,
-        seed: int,
-        n_blocks: int,
-        *,
-        first: int = 0,
-        family: str = "train",
-        degraded_share: float = 0.0,
-        spine_mm: float | None = None,
-        window_px: int = 320,
-    ) -> Iterator[TrainingPatches]:
-        """Blocks of training patches with truth; see `training_patches.training_blocks`."""
-        skeleton = self.skeleton
-        m = BLOCK // PER_SESSION
-        each = np.repeat(np.arange(m), PER_SESSION)
-        nominal = 1.0 if spine_mm is None else spine_mm / skeleton.length
-        flat = np.zeros((BLOCK, 3))
-        for number in range(first, first + n_blocks):
-            rng = np.random.default_rng([seed, number, 1])
-            cameras = _draw_cameras(rng, m)
-            degrade(rng, cameras[-1], degraded_share)
-            shape = draw_hands(rng, skeleton, family, m)[each]
-            size = (nominal * rng.uniform(*SIZE_RANGE, m))[each]
-            kind, size_px = cameras[0][each], cameras[2][each]
-            intrinsics, parameters = cameras[1][each], cameras[3][each]
-            low, high = np.array([k[2:4] for k in _KINDS]).T[:, kind]
-            turns = draw_turns(rng, BLOCK, anywhere=0.4)
-            places = draw_places(rng, intrinsics, size_px.astype(float), low, high)
-            pose = pose_hands(draw_postures(rng, skeleton, BLOCK), turns, size, places)
-            contents = assemble(
-                rng, skeleton, pose, shape, size, intrinsics, parameters, 0.15, PER_SESSION
-            )
-            uv = contents.hand[..., :2] / contents.hand[..., 2:] * intrinsics[:, None, :2]
-            uv = uv + intrinsics[:, None, 2:]
-            shift = rng.uniform(-0.08, 0.08, (BLOCK, 2)) * window_px
-            middle = (uv.min(axis=1) + uv.max(axis=1)) / 2.0
-            origin = np.floor(middle - window_px / 2.0 + shift).astype(np.int64)
-            # an arm leaves a window as it leaves an image
-            origin = np.clip(origin, 0, np.maximum(size_px - window_px, 0))
-            depth = contents.images(
-                PatchCamera(intrinsics, size_px, origin), (window_px, window_px)
-            )
-            yield TrainingPatches(
-                depth,
-                np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
-                origin.astype(np.int32),
-                intrinsics,
-                flat,
-                pose.root,
-                pose.angles,
-                pose.scale,
-                contents.joints,
-                contents.spine_mm,
-                shape,
-                own_bones=True,
-            )
-
-    def test_split(
-        self, name: str, spine_mm: float | None = None, n_sessions: int = 40
-    ) -> list[HandSession]:
-        """The recordings of a split: by default 40 of 50 independent frames, each of another hand.
-
-        Args:
-            name: 'clean', 'hard', 'other-body', 'other-camera', or 'sealed', see
-                `recording.SEALED`.
-            spine_mm: length of every hand, mm; None draws it.
-            n_sessions: number of recordings, from the first on.
-
-        Returns:
-            The recordings, recording k named after the split and k.
-
-        Raises:
-            LiexError: there is no split of this name.
-        """
-        others = unseen((NYU_SENSOR, KINECT_V2_SENSOR))
-        sessions = []
-        for turn, kind, settings in planned(name, n_sessions, SPLITS, _SEALED_SEED):
-            sensor = others[turn % len(others)] if kind == OTHER_CAMERA else NYU_SENSOR
-            settings |= {"sensor": sensor, "spine_mm": spine_mm}
-            sessions.append(self._film(50, self._test_hands, **settings))
-        return sessions
-
-    def _film(
-        self,
-        n_frames: int,
-        act: Callable[[np.random.Generator, PatchCamera], _Acted],
-        *,
-        seed: int | list[int],
-        sensor: Sensor = NYU_SENSOR,
-        family: str = "train",
-        noise: float = 1.0,
-        erosion_px: int = 0,
-        object_share: float = 0.0,
-        spine_mm: float | None = None,
-        name: str = "gestures",
-    ) -> HandSession:
-        """A recording of one person, whose angles, orientations, places and wrists `act` draws."""
-        rng = np.random.default_rng(seed)
-        skeleton = self.skeleton
-        drawn = float(rng.uniform(*SIZE_RANGE))
-        size = np.full(n_frames, drawn if spine_mm is None else spine_mm / skeleton.length)
-        shape = draw_hands(rng, skeleton, family, 1)[np.zeros(n_frames, np.int64)]
-        cameras = whole_images(sensor.camera, n_frames)
-        angles, turns, places, wrists = act(rng, cameras)
-        parameters = np.repeat(
-            sensor.draw(rng, 1, np.zeros(1), noise, erosion_px), n_frames, axis=0
-        )
-        contents = assemble(
+        rng: np.random.Generator,
+        family: str,
+        degraded_share: float,
+        nominal: float,
+        window_px: int,
+        per_session: int,
+    ) -> TrainingPatches:
+        n, surface = training_patches.BLOCK, Surface.of(self.skeleton)
+        m = n // per_session
+        each = np.repeat(np.arange(m), per_session)
+        nearest, farthest, share = np.array([kind[1:] for kind in _KINDS]).T
+        make = rng.choice(len(_KINDS), m, p=share)
+        sensors = tuple(kind[0] for kind in _KINDS)
+        intrinsics, size_px, parameters = draw_units(rng, sensors, make, np.zeros(m))
+        size_px[:, 1] = np.maximum(size_px[:, 1], self.patch_px)
+        training_patches.degrade(rng, parameters, degraded_share)
+        flat = np.zeros((m, 3))
+        ground = np.zeros((m, kernels.N_GROUND))
+        views = Views(intrinsics, size_px, SE3.identity(m), parameters, ground, flat)[each]
+        shape = draw_hands(rng, self.skeleton, family, m)[each]
+        size = (nominal * rng.uniform(*self.sizes, m))[each]
+        low, high = np.array([nearest, farthest])[:, make[each]]
+        turns = draw_turns(rng, n, anywhere=0.4)
+        places = draw_places(rng, views.intrinsics, views.size_px, low, high)
+        pose = pose_hands(draw_postures(rng, self.skeleton, n), turns, size, places)
+        hand, objects, walls = surround(
             rng,
-            skeleton,
-            pose_hands(angles, turns, size, places),
+            pose,
             shape,
-            size,
-            cameras.intrinsics,
-            parameters,
-            object_share,
-            1 if wrists is None else n_frames,
-            wrists,
+            views.intrinsics,
+            0.15,
+            per_session,
+            None,
+            surface,
+            SE3.identity(),
         )
-        return HandSession(name, skeleton, sensor, contents)
+        seeds = rng.integers(1, 2**63, n).astype(np.uint64)
+        shift = rng.uniform(-0.08, 0.08, (n, 2)) * window_px
+        # an arm leaves a window as it leaves an image
+        origin = views.around(hand.hand, window_px, shift)
+        origin = np.clip(origin, 0, np.maximum(views.size_px - window_px, 0))
+        solids = [*hand.solids, *objects]
+        shape_px = (window_px, window_px)
+        depth, _ = replace(views, ground=walls).render(solids, seeds, origin, shape_px)
+        return TrainingPatches(
+            depth,
+            np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
+            origin.astype(np.int32),
+            views.intrinsics,
+            views.floor,
+            pose.root,
+            pose.angles,
+            pose.scale,
+            hand.joints,
+            size * self.skeleton.length,
+            shape,
+            own_bones=True,
+        )
 
-    def _test_hands(self, rng: np.random.Generator, cameras: PatchCamera) -> _Acted:
+    def _stage(
+        self,
+        rng: np.random.Generator,
+        sensor: Sensor,
+        length: float,
+        n: int,
+        moving: bool,
+        family: str,
+        noise: float,
+        erosion_px: int,
+        object_share: float,
+    ) -> Stage:
+        skeleton, camera = self.skeleton, sensor.camera
+        shape = draw_hands(rng, skeleton, family, 1)[np.zeros(n, np.int64)]
+        intrinsics = np.tile(camera.intrinsics, (n, 1))
+        size_px = np.tile(np.array([camera.width, camera.height]), (n, 1))
+        act = self._gestures if moving else self._test_hands
+        angles, turns, places, wrists = act(rng, intrinsics, size_px)
+        parameters = sensor.draw(rng, 1, np.zeros(1), noise, erosion_px)
+        pose = pose_hands(angles, turns, np.full(n, length / skeleton.length), places)
+        T = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1300.0, camera).T_arena_camera
+        hand, objects, walls = surround(
+            rng,
+            pose,
+            shape,
+            intrinsics,
+            object_share,
+            n if moving else 1,
+            wrists,
+            Surface.of(skeleton),
+            T,
+        )
+        return Stage(
+            SimulatedScene(camera, T, BOX, np.zeros(2), np.full(2, np.inf), 0.0, 0.0),
+            skeleton,
+            (hand,),
+            objects,
+            np.repeat(parameters, n, axis=0),
+            rng.integers(1, 2**63, n).astype(np.uint64),
+            np.arange(n) * self.frame_ns,
+            ground=walls,
+        )
+
+    def _test_hands(
+        self, rng: np.random.Generator, intrinsics: Array, size_px: NDArray[np.int64]
+    ) -> _Acted:
         """Independent hands, with postures of the reference, or of the training without one."""
-        n = len(cameras.size)
+        n = len(size_px)
         if self.reference is None:
             angles, turns = draw_postures(rng, self.skeleton, n), draw_turns(rng, n)
         else:
@@ -631,52 +510,14 @@ class HandSimulator:
                 pose.angles,
                 sight_rotations(pose.root.translation) @ pose.root.rotation,
             )
-        places = draw_places(
-            rng,
-            cameras.intrinsics,
-            cameras.size.astype(float),
-            *np.array([[400.0], [1200.0]]).repeat(n, axis=1),
-        )
+        low, high = np.array([[400.0], [1200.0]]).repeat(n, axis=1)
+        places = draw_places(rng, intrinsics, size_px, low, high)
         return angles, turns, places, None
 
-    def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> HandSession:
-        """A recording of one person moving from gesture to gesture at 30 frames/s, with pauses.
-
-        Args:
-            seed: seed or seeds of all random numbers.
-            n_frames: length of the recording.
-            **settings: sensor (the NYU camera), family, noise, erosion_px, object_share, spine_mm
-                and name, as in `locomotion.moving_session`.
-
-        Returns:
-            The recording with its truth.
-        """
-
-        def act(rng: np.random.Generator, cameras: PatchCamera) -> _Acted:
-            near, far = np.array([[550.0], [850.0]])
-            size = cameras.size[:1].astype(float)
-            (middle,) = draw_places(rng, cameras.intrinsics[:1], size, near, far)
-            return draw_gestures(rng, self.skeleton, n_frames, FRAME_NS * 1e-9, middle)
-
-        return self._film(n_frames, act, seed=seed, **settings)
-
-
-def _draw_cameras(
-    rng: np.random.Generator, m: int
-) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-    """Kind (m,), intrinsics (m, 4), image size (m, 2) and sensor parameters of m cameras."""
-    kind = rng.choice(len(_KINDS), m, p=[k[4] for k in _KINDS])
-    focal = rng.uniform(0.97, 1.03, (m, 1))
-    axis = rng.normal(0.0, 4.0, (m, 2))
-    intrinsics = np.empty((m, 4))
-    size_px = np.empty((m, 2), np.int64)
-    parameters = np.empty((m, N_PARAMETERS))
-    for k, (sensor, coarse, *_) in enumerate(_KINDS):
-        rows = kind == k
-        c = sensor.camera
-        parameters[rows] = sensor.draw(rng, m, np.zeros(m))[rows]
-        whole = np.concatenate([focal * [c.fx, c.fy], axis + np.array([c.cx, c.cy])], axis=1)
-        intrinsics[rows] = whole[rows] / coarse
-        # windows are cut from at least 320 rows
-        size_px[rows] = (c.width // coarse, max(c.height // coarse, 320))
-    return kind, intrinsics, size_px, parameters
+    def _gestures(
+        self, rng: np.random.Generator, intrinsics: Array, size_px: NDArray[np.int64]
+    ) -> _Acted:
+        """Moves from gesture to gesture, with pauses."""
+        near, far = np.array([[550.0], [850.0]])
+        (middle,) = draw_places(rng, intrinsics[:1], size_px[:1], near, far)
+        return draw_gestures(rng, self.skeleton, len(size_px), self.frame_ns * 1e-9, middle)

@@ -8,12 +8,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import RecordingError
+from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.simulation.hand.simulator import HandSimulator
-from liex_lab.simulation.locomotion import moving_session
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.hand.simulator import HandSpecies
+from liex_lab.simulation.recording import Actor, RenderedRecording, Stage
+from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import (
     BOX,
     OBJECT_FACES,
@@ -27,17 +27,14 @@ from liex_lab.simulation.scene import (
 from liex_lab.simulation.scenes import places
 from liex_lab.simulation.scenes.places import Bedding, Ground, Mesh, box, render_still
 from liex_lab.simulation.scenes.stage import (
-    Mirrored,
-    Moving,
-    SceneAnimal,
-    SceneContents,
-    SceneRecording,
     calm_script,
+    draw_mouse,
     keeping_apart,
     timing_of,
     visiting,
 )
-from liex_lab.simulation.species import KINECT_V2_SENSOR, FishSpecies, MouseSpecies, Sensor
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
+from liex_lab.simulation.species import FishSpecies, MouseSpecies
 
 
 @dataclass(frozen=True)
@@ -202,9 +199,9 @@ class Making:
         parts = ("camera", "place", "floor", "bedding", "worn", "sensor", "noise", "object")
         return np.random.default_rng([self.seed, 77, parts.index(part)])
 
-    def recording(self, name: str) -> SceneRecording:
+    def recording(self, name: str) -> RenderedRecording:
         """The recording of this name with the truth of all animals in it."""
-        recipe = self.recipe
+        recipe, n = self.recipe, self.n_frames
         species = MouseSpecies()
         arenas = self._arenas()
         animals, moving, parts = self._cast(species, arenas)
@@ -212,28 +209,30 @@ class Making:
         floor = self._rng("floor")
         grounds = [Ground.draw(floor, arena) for arena in arenas]
         if recipe.bedding:
-            tracks = animals[0].middle(species)[:, :2]
-            tracks = np.where(animals[0].present[:, None], tracks, np.nan)
-            beddings = [Bedding.draw(self._rng("bedding"), grounds[0], tracks, self._epoch_frames)]
-            animals = (animals[0].lifted(beddings[0].below(np.nan_to_num(tracks))), *animals[1:])
+            tracks = _middle(animals[0])
+            present = np.where(animals[0].present[:, None], tracks, np.nan)
+            beddings = [Bedding.draw(self._rng("bedding"), grounds[0], present, self._epoch_frames)]
+            lift = SE3.identity(n)
+            lift.translation[:, 2] = beddings[0].below(np.nan_to_num(present))
+            animals[0] = replace(animals[0], pose=animals[0].pose.moved(lift))
         moving += self._worn(species, arenas[0], animals, parts)
         stills, epoch = self._stills(arenas, grounds, beddings, parts)
-        fur = animals[0].shape.fur if animals else np.array([0.5])
-        noise = self._rng("noise")
-        stage = SceneContents(
-            arenas[0].camera,
-            arenas[0].T_arena_camera,
-            species,
+        fur = animals[0].body.fur if animals else np.array([0.5])
+        parameters = self.sensor.draw(self._rng("sensor"), 1, fur)
+        warming = 1.0 - np.exp(-np.arange(n) / max(1.0, 0.35 * n))
+        stage = Stage(
+            arenas[0],
+            species.skeleton,
             tuple(animals),
             tuple(moving),
+            np.repeat(parameters, n, axis=0),
+            self._rng("noise").integers(1, 2**63, n).astype(np.uint64),
+            np.arange(n) * species.frame_ns,
             stills,
             epoch,
-            self.sensor.draw(self._rng("sensor"), 1, fur)[0],
-            noise.integers(1, 2**63, self.n_frames).astype(np.uint64),
-            recipe.drift_mm
-            * (1.0 - np.exp(-np.arange(self.n_frames) / max(1.0, 0.35 * self.n_frames))),
+            offset_mm=recipe.drift_mm * warming if recipe.drift_mm else None,
         )
-        return SceneRecording(name, stage)
+        return RenderedRecording(name, stage)
 
     @property
     def _epoch_frames(self) -> int:
@@ -289,25 +288,25 @@ class Making:
 
     def _cast(
         self, species: MouseSpecies, arenas: list[SimulatedScene]
-    ) -> tuple[tuple[SceneAnimal, ...], list[Moving], list[Mesh]]:
+    ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals, the objects that move with them, and the still objects they need."""
         recipe = self.recipe
         timing = timing_of(recipe.presence, self.n_frames)
         script = path = None
         still: list[Mesh] = []
-        moving: list[Moving] = []
+        moving: list[Solid] = []
         if recipe.fixture == "house":
             place, out = self._house(arenas[0])
             ahead = np.array([np.cos(out), np.sin(out)])
             path = visiting(place + 105.0 * ahead, place - 6.0 * ahead, ((0.1, 0.55), (0.72, 0.95)))
             script = calm_script
             still += places.house(arenas[0], place, out)
-        animals: list[SceneAnimal] = []
+        animals: list[Actor] = []
         for which in range(max(recipe.n_animals, recipe.n_arenas) if recipe.n_animals else 0):
             arena = arenas[which % len(arenas)]
             if which and recipe.n_arenas == 1:
-                path = keeping_apart(animals[0].middle(species)[:, :2], animals[0].spine_mm)
-            animal = SceneAnimal.draw(
+                path = keeping_apart(_middle(animals[0]), animals[0].spine_mm)
+            animal = draw_mouse(
                 self.seed, which, species, arena, self.family, self.spine_mm, timing, script, path
             )
             animals.append(animal)
@@ -315,16 +314,16 @@ class Making:
             change = int(_OBJECTS[recipe.fixture] * self.n_frames)
             later = np.arange(self.n_frames) >= change
             item = self._object(arenas[0])
-            moving.append(Moving.of(item, later if recipe.fixture == "object" else ~later))
+            moving.append(Solid.of(*item, later if recipe.fixture == "object" else ~later))
             moving.append(self._hand(item.vertices[:, :2].mean(axis=0), change))
         if recipe.presence in ("late", "leaves") and animals:
             there = animals[0].present
             change = int(np.argmax(there)) if recipe.presence == "late" else int(there.sum())
-            spot = animals[0].middle(species)[min(change, self.n_frames - 1), :2]
+            spot = _middle(animals[0])[min(change, self.n_frames - 1)]
             moving.append(self._hand(spot, change))
-        return tuple(animals), moving, still
+        return animals, moving, still
 
-    def _hand(self, spot: Array, change: int) -> Moving:
+    def _hand(self, spot: Array, change: int) -> Solid:
         """A hand that moves down to a position, releases or takes something, and leaves."""
         mesh = draw_object(self._rng("object"), "hand", 65.0)
         mesh[:, 2] -= mesh[:, 2].min()
@@ -334,29 +333,29 @@ class Making:
         vertices = mesh + np.column_stack([np.tile(spot, (len(height), 1)), height])[:, None]
         moment = np.arange(self.n_frames) - change + reach
         there = (moment >= 0) & (moment < len(height))
-        return Moving(Mesh(vertices, OBJECT_FACES), np.where(there, moment, -1))
+        return Solid(OBJECT_FACES, np.where(there, moment, -1), vertices.__getitem__)
 
     def _worn(
         self,
         species: MouseSpecies,
         arena: SimulatedScene,
-        animals: tuple[SceneAnimal, ...],
+        animals: list[Actor],
         parts: list[Mesh],
-    ) -> list[Moving]:
+    ) -> list[Solid]:
         """Objects worn by the first animal."""
         if not self.recipe.worn:
             return []
         rng = self._rng("worn")
         animal = animals[0]
-        mount = places.on_head(species.skeleton, animal.pose, animal.shape[0], animal.girth)
+        mount = places.on_head(species.skeleton, animal.pose, animal.body[0], animal.girth)
         sides = places.HEAD_STAGE_MM if self.recipe.worn == "head stage" else places.PLUG_MM
-        moving = [Moving.of(places.stage_on(mount, sides), animal.present)]
+        moving = [Solid.of(*places.stage_on(mount, sides), animal.present)]
         if self.recipe.worn == "tether":
             spot = arena.centre + _COMMUTATOR_MM[:2] + rng.normal(0.0, 15.0, 2)
             above = np.array([*spot, _COMMUTATOR_MM[2]])
             parts += places.holder(above)
             cable = places.tether(rng, mount, above, float(rng.uniform(3.0, 5.0)))
-            moving.append(Moving.of(cable, animal.present))
+            moving.append(Solid.of(*cable, animal.present))
         return moving
 
     def _stills(
@@ -398,6 +397,11 @@ class Making:
             if recipe.glossy:
                 still[bare & _reflections(self._rng("floor"), rng, camera, still.shape)] = 0.0
         return stills, epoch
+
+
+def _middle(animal: Actor) -> Array:
+    """The mean of an animal's joints (n, 2), mm, in the floor."""
+    return np.asarray(animal.joints.mean(axis=1)[:, :2])
 
 
 def _reflections(
@@ -447,7 +451,7 @@ def film(
     sensor: Sensor = KINECT_V2_SENSOR,
     family: str = "other",
     spine_mm: float | None = None,
-) -> TrueRecording:
+) -> RenderedRecording:
     """A recording of a scene.
 
     Args:
@@ -473,6 +477,6 @@ def film(
         return making.recording(title)
     body: dict[str, Any] = {"family": family, "spine_mm": spine_mm, "name": title}
     if name == "fish":
-        return moving_session(FishSpecies(), [seed, 5], n_frames, **body)
-    hand = HandSimulator(Skeleton.load("hand")).motion([seed, 6], n_frames, **body)
-    return hand if name == "hand" else Mirrored(title, hand)
+        return FishSpecies().motion([seed, 5], n_frames, **body)
+    hand = HandSpecies().motion([seed, 6], n_frames, **body)
+    return hand if name == "hand" else RenderedRecording(title, hand.stage, mirrored=True)

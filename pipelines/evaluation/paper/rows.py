@@ -33,7 +33,7 @@ from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene import _height_map_kernels, height_maps
-from liex_lab.simulation.recording import TrueRecording
+from liex_lab.simulation.recording import RenderedRecording
 
 from ...build import build_scene, plan_of
 from ...training.action_model import Scenario, cut_sequences, rendered, staged
@@ -41,7 +41,7 @@ from ...training.pose_model import estimator_of, recipe_of, rendered_set
 from ..pose import Subject, subject_of, unpacked
 from ..speed import SpeedSample, two_cores
 
-Tests = Mapping[str, Sequence[TrueRecording]]  # by split
+Tests = Mapping[str, Sequence[RenderedRecording]]  # by split
 
 ROWS = ("default", "paper", "paper-one-pose", "paper-no-metric", "rf", "cnn")
 SWEPT = ("paper", "default")  # whose curves (Fig. 7) and failures (Fig. 17) are drawn
@@ -98,7 +98,7 @@ class CommonView:
 
 
 def common_view(
-    recording: TrueRecording, plan: Plan, chooser: estimator.PoseEstimator
+    recording: RenderedRecording, plan: Plan, chooser: estimator.PoseEstimator
 ) -> tuple[height_maps.Segmenter, NDArray[np.float32], CommonView]:
     """Process a recording as `liex run` would, up to the pose.
 
@@ -121,7 +121,7 @@ def common_view(
 
 
 def is_other(
-    crops: height_maps.HeightMaps, crop_cameras: Array, recording: TrueRecording
+    crops: height_maps.HeightMaps, crop_cameras: Array, recording: RenderedRecording
 ) -> NDArray[np.bool_]:
     """Whether (n,) a component is another object than the animal, by its centroid."""
     T = height_maps.view_of(crop_cameras)
@@ -254,7 +254,7 @@ def numbers_of(runs: Sequence[PoseErrors], views: Sequence[CommonView]) -> dict[
 
 
 def rates_of(
-    animal: str, subjects: Mapping[str, Subject], recordings: Sequence[TrueRecording]
+    animal: str, subjects: Mapping[str, Subject], recordings: Sequence[RenderedRecording]
 ) -> dict[str, dict[str, Any]]:
     """Frames per second of each subject on at most two cores, foreground included.
 
@@ -282,7 +282,7 @@ def rates_of(
     }
 
 
-def example_frames(recordings: Sequence[TrueRecording]) -> list[tuple[int, int]]:
+def example_frames(recordings: Sequence[RenderedRecording]) -> list[tuple[int, int]]:
     """The example frames of a split: the middle of the first recording and of the one halfway.
 
     Returns:
@@ -303,7 +303,7 @@ def pose_at(split: str, recording: int, frame: int, joints: Array) -> dict[str, 
 
 
 def failures_in(
-    split: str, joints: Sequence[Array], recordings: Sequence[TrueRecording]
+    split: str, joints: Sequence[Array], recordings: Sequence[RenderedRecording]
 ) -> list[dict[str, Any]]:
     """The worst frames of one row on one split, of different recordings, worst first.
 
@@ -625,7 +625,7 @@ def _key_frames(scenario: Scenario) -> dict[str, Any]:
     """Generate an action, and render it at evenly spaced key frames."""
     rng = np.random.default_rng([scenario.individual, scenario.seed])
     stage = staged(scenario, rng)
-    motion, steps, pose, _, _, species, camera, *_ = stage
+    motion, steps, pose, _, species, views, *_ = stage
     inside = np.flatnonzero(motion.word[steps] == scenario.word)
     # at most four key frames
     rows = np.linspace(0, len(inside) - 1, min(4, len(inside))).round().astype(int)
@@ -638,7 +638,7 @@ def _key_frames(scenario: Scenario) -> dict[str, Any]:
         axes = np.array([[*_direction(middle), 0.0], [0.0, 0.0, 1.0]])
     bodies = []
     for k, row in enumerate(rows):
-        points = _visible_points(patches, k, camera.T_arena_camera)
+        points = _visible_points(patches, k, views.T_arena_camera[0])
         off = np.linalg.norm(points[:, None] - joints[row], axis=-1).min(axis=1)
         # points farther from every joint are noise
         body = points[off < 0.25 * species.skeleton.length]

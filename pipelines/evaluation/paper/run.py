@@ -356,7 +356,7 @@ def _tests(skeleton: Skeleton, budget: Budget) -> Tests:
     """The test recordings by split."""
     world, n = world_of(skeleton), _N_SESSIONS
     if budget.n_frames is not None:
-        n = -(-budget.n_frames // len(world.test_split(world.splits[0], n_sessions=1)[0]))
+        n = -(-budget.n_frames // len(world.test_split(next(iter(world.splits)), n_sessions=1)[0]))
     splits = (SEALED,) if budget.sealed else world.splits
     return {split: world.test_split(split, n_sessions=n) for split in splits}
 

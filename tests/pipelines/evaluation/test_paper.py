@@ -7,7 +7,7 @@ import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -28,8 +28,9 @@ from liex_lab.forests.grow import GrowthPlan
 from liex_lab.runtime.progress import silent
 from liex_lab.sessions.provenance import package_version
 from liex_lab.simulation import simulator
-from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR, MouseSpecies
+from liex_lab.simulation.recording import SPLITS, RenderedRecording
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR
+from liex_lab.simulation.species import MouseSpecies
 from tests.estimation.toy import toy_mice, trained, training_set
 
 N_FRAMES = 6
@@ -46,19 +47,16 @@ FIGURES = [
 ]
 
 
-class SmallWorld(simulator.BodySimulator):
+class SmallWorld(MouseSpecies):
     """Two splits of two recordings of a few small frames."""
 
-    def __init__(self) -> None:
-        super().__init__(MouseSpecies(Skeleton.load("mouse")), ("clean", "hard"))
+    splits: ClassVar = {name: SPLITS[name] for name in ("clean", "hard")}
 
     def test_split(
         self, name: str, spine_mm: float | None = None, n_sessions: int = 2
-    ) -> list[SyntheticSession]:
+    ) -> list[RenderedRecording]:
         return [
-            SyntheticSession.draw(
-                [len(name), k], N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, name=f"{name}-{k}"
-            )
+            self.film([len(name), k], N_FRAMES, sensor=PRIMESENSE_QVGA_SENSOR, name=f"{name}-{k}")
             for k in range(min(n_sessions, 2))
         ]
 

@@ -20,9 +20,10 @@ from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.recording import SyntheticSession
-from liex_lab.simulation.simulator import BodySimulator, world_of
-from liex_lab.simulation.species import PRIMESENSE_QVGA_SENSOR, PRIMESENSE_SENSOR
+from liex_lab.simulation.recording import RenderedRecording
+from liex_lab.simulation.sensors import PRIMESENSE_QVGA_SENSOR, PRIMESENSE_SENSOR
+from liex_lab.simulation.simulator import world_of
+from liex_lab.simulation.species import MouseSpecies, Species
 from liex_lab.tracking.track import Track
 from tests.estimation.toy import trained
 from tests.sessions import walking_mouse
@@ -50,16 +51,16 @@ def small_world(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two recordings of 10 small frames stand for every split, toy models for every variant."""
 
     def small_split(
-        self: BodySimulator, name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any
-    ) -> list[SyntheticSession]:
+        self: Species, name: str, spine_mm: float | None = None, n_sessions: int = 2, *_: Any
+    ) -> list[RenderedRecording]:
         return [
-            SyntheticSession.draw(
+            MouseSpecies().film(
                 [5, k], 10, sensor=PRIMESENSE_QVGA_SENSOR, spine_mm=spine_mm, name=f"{name}-{k}"
             )
             for k in range(min(n_sessions, 2))
         ]
 
-    monkeypatch.setattr(BodySimulator, "test_split", small_split)
+    monkeypatch.setattr(Species, "test_split", small_split)
     for module in (pose, speed):
         monkeypatch.setattr(module, "estimator_of", toy_estimator)
 
@@ -102,10 +103,10 @@ def test_errors_over_sizes_are_in_per_cent_of_the_spine(monkeypatch):
 
 @pytest.mark.usefixtures("small_world")
 def test_the_numbers_of_evaluate_speed_have_their_names(monkeypatch):
-    def one_of_640(self: BodySimulator, name: str, **how: Any) -> list[SyntheticSession]:
-        return [SyntheticSession.draw(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
+    def one_of_640(self: Species, name: str, **how: Any) -> list[RenderedRecording]:
+        return [MouseSpecies().film(3, 6, sensor=PRIMESENSE_SENSOR, name=name)]
 
-    monkeypatch.setattr(BodySimulator, "test_split", one_of_640)
+    monkeypatch.setattr(Species, "test_split", one_of_640)
     monkeypatch.setattr(speed, "N_FRAMES", 8)
     monkeypatch.setattr(speed, "N_REPEATS", 1)
     result = speed.evaluate_speed("mouse")
@@ -128,14 +129,14 @@ def test_a_clock_restores_the_threads_and_a_process_that_fails_says_so():
 
 @pytest.mark.usefixtures("small_world")
 def test_what_is_lost_in_a_rendered_recording_counts_as_lost(monkeypatch):
-    drawn = SyntheticSession.depths
+    drawn = RenderedRecording.depths
 
-    def without_frame_4(self: SyntheticSession, start: int, stop: int) -> np.ndarray:
+    def without_frame_4(self: RenderedRecording, start: int, stop: int) -> np.ndarray:
         depths = drawn(self, start, stop)
         depths[np.arange(start, stop) == 4] = 0.0
         return depths
 
-    monkeypatch.setattr(SyntheticSession, "depths", without_frame_4)
+    monkeypatch.setattr(RenderedRecording, "depths", without_frame_4)
     sessions = world_of(Skeleton.load("mouse")).test_split("clean", n_sessions=1)
     toy = toy_estimator("mouse", "default")
     errors = pose.errors_of(toy, sessions, Plan.load("mouse"), silent)

@@ -19,7 +19,7 @@ from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.sessions import Session
 from liex_lab.simulation import training_patches
-from liex_lab.simulation.simulator import BodySimulator
+from liex_lab.simulation.species import Species
 
 SNAKE = str(find_sample("snake.toml"))
 
@@ -86,9 +86,9 @@ def test_a_whole_model_finds_rendered_snakes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = pose_model.train_model(SNAKE, "default", tmp_path / "snake.npz", n_images=1024)
-    drawn = BodySimulator.test_split
+    drawn = Species.test_split
     monkeypatch.setattr(
-        BodySimulator, "test_split", lambda world, name, spine_mm: drawn(world, name, spine_mm, 2)
+        Species, "test_split", lambda world, name, spine_mm: drawn(world, name, spine_mm, 2)
     )
     result = evaluate_pose(SNAKE, "clean", model=model)
     assert result["n_frames"] == 100
