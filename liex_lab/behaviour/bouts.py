@@ -3,7 +3,7 @@
 Bouts are named by a rule, a model or a person. The limits of a definition come from
 `actions.vocabulary`.
 
-Rules name the actions of a mouse (rear, run, walk, pause) by double thresholds on speed and height:
+Rules name the actions of a mouse (`ACTIONS`) by double thresholds on speed, height and posture:
 one label per frame, half-open bouts, never across a gap. For every action: hysteresis (two
 thresholds, enter and leave), then interruptions shorter than `merge_pauses_s` are bridged, then
 bouts shorter than `min_bout_s` are dropped. If two actions claim a frame, the first of `ACTIONS`
@@ -367,7 +367,7 @@ def measure_bouts(
 
 # The rule-based ethogram of a mouse.
 
-ACTIONS = ("rear", "run", "walk", "pause")  # if two claim a frame, the first wins
+ACTIONS = ("rear", "groom", "run", "walk", "pause")  # if two claim a frame, the first wins
 
 Mask = NDArray[np.bool_]
 
@@ -379,7 +379,7 @@ class MouseRules(BehaviourThresholds):
     40 mm are those of Live Mouse Tracker; an animal shorter than 100 mm rears from 0.4 of its own
     length, as in the definitions of `actions.vocabulary`. A bout of rearing extends down to half of
     that height. Heights are above the usual one of the tail's base, which errs less than that of
-    one frame.
+    one frame. A hunched posture of a nearly still animal is grooming, as in `actions.vocabulary`.
     """
 
     def rear_mm(self, spine_mm: float) -> float:
@@ -398,6 +398,12 @@ class MouseRules(BehaviourThresholds):
                 f"tail's base, or {self.rear_height_bl:g} body lengths for an animal shorter than "
                 f"{self.rear_height_mm / self.rear_height_bl:.0f} mm; rising and descending "
                 f"belong to it, down to {self.rear_leave:.0%} of that height"
+            ),
+            "groom": (
+                f"sits hunched: the body's centre moves slower than {self.groom_below_mm_s / 10:g} "
+                f"cm/s and the nose is within {self.groom_reach_bl:g} body lengths of the tail's "
+                f"base, seen from above, until beyond {self.groom_leave_bl:g}; a mouse that rests "
+                "curled up meets this, too"
             ),
             "run": f"the body's centre moves faster than {run}",
             "walk": f"the body's centre moves at {walk} to {run}",
@@ -445,14 +451,16 @@ def raw_labels(
 
     Args:
         kinematics: the table `kinematics`; without nose_over_rump_mm (a swimming animal) nothing
-            rears.
+            rears or grooms.
         spine_mm: length of the animal's spine, mm.
         number: (n,) unbroken stretch of each frame, see `segments`.
         rules: the thresholds.
     """
     speed = kinematics["speed_mm_s"].to_numpy(float)
-    raised = speed * np.nan
+    raised, hunched = np.full((2, len(speed)), np.nan)
     if "nose_over_rump_mm" in kinematics:
+        reach = kinematics["reach_mm"].to_numpy(float) / spine_mm
+        hunched[speed < rules.groom_below_mm_s] = -reach[speed < rules.groom_below_mm_s]
         nose = kinematics["nose_height_mm"].to_numpy(float)
         raised = nose - of_known(np.median, nose - kinematics["nose_over_rump_mm"].to_numpy(float))
     rear_mm = rules.rear_mm(spine_mm)
@@ -463,6 +471,7 @@ def raw_labels(
     known = np.isfinite(speed)
     return {
         "rear": hysteresis(raised, rear_mm, rules.rear_leave * rear_mm, number),
+        "groom": hysteresis(hunched, -rules.groom_reach_bl, -rules.groom_leave_bl, number),
         "run": running & known,
         "walk": moving & ~running & known,
         "pause": ~moving & known,

@@ -462,6 +462,15 @@ class BehaviourThresholds(SettingsTable):
     rear_leave: Positive = Field(
         0.5, le=1, description="rearing ends when the nose is below this share of that height"
     )
+    groom_reach_bl: Positive = Field(
+        0.7,
+        description=(
+            "grooming begins when a slow animal is so hunched that, seen from above, its nose is "
+            "within this many body lengths of its tail's base ..."
+        ),
+    )
+    groom_leave_bl: Positive = Field(0.8, description="... and ends beyond this many")
+    groom_below_mm_s: Positive = Field(20.0, description="a faster animal does not groom")
     speed_hysteresis: NotNegative = Field(
         0.1,
         lt=1,

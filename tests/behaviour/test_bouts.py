@@ -48,6 +48,16 @@ def test_speed_names_the_stretch(speed, word):
     assert bouts["net_turn_rad"].iloc[0] == pytest.approx(speed / 400.0 * 59 / 30, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("speed", "words"), [(5.0, ["pause", "groom", "pause"]), (30.0, ["pause"])]
+)
+def test_a_hunched_animal_grooms_if_it_stays_where_it_is(speed, words):
+    frames, poses = tables_of(WalkingMouse(steady(3.0), speed_mm_s=speed, radius_mm=400.0))
+    moved = kinematics(frames, poses)
+    moved.loc[30:60, "reach_mm"] = 0.65 * frames["spine_mm"].median()
+    assert list(find_bouts(frames, moved)["action"]) == words
+
+
 def test_a_bout_ends_at_a_gap_one_step_after_its_last_frame():
     bouts = bouts_of(WalkingMouse(np.delete(steady(2.0), slice(30, 40))))
     assert list(bouts["action"]) == ["walk", "walk"]

@@ -56,7 +56,7 @@ def test_a_session_says_where_it_comes_from(session):
     assert about["timings_s"]["write"] > 0
     most_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert 20 < about["peak_memory_mb"] <= most_kb / 1024
-    assert set(about["actions"]) == {"rear", "run", "walk", "pause"}
+    assert set(about["actions"]) == {"rear", "groom", "run", "walk", "pause"}
     assert about["rules"]["rear_height_mm"] == 40.0
     row = session.table("sessions").iloc[0]
     assert (row["subject_id"], row["group"], row["cage"]) == ("m01", "control", "")
