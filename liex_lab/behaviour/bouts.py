@@ -402,7 +402,7 @@ class MouseRules(BehaviourThresholds):
             "groom": (
                 f"sits hunched: the body's centre moves slower than {self.groom_below_mm_s / 10:g} "
                 f"cm/s and the nose is within {self.groom_reach_bl:g} body lengths of the tail's "
-                f"base, seen from above, until beyond {self.groom_leave_bl:g}; a mouse that rests "
+                f"base in top view, until beyond {self.groom_leave_bl:g}; a mouse that rests "
                 "curled up meets this, too"
             ),
             "run": f"the body's centre moves faster than {run}",

@@ -465,7 +465,7 @@ class BehaviourThresholds(SettingsTable):
     groom_reach_bl: Positive = Field(
         0.7,
         description=(
-            "grooming begins when a slow animal is so hunched that, seen from above, its nose is "
+            "grooming begins when a slow animal is so hunched that its nose, in top view, is "
             "within this many body lengths of its tail's base ..."
         ),
     )
