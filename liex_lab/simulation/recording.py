@@ -176,7 +176,6 @@ class RenderedRecording(Recording):
         stage: everything before the camera.
         events: its corruptions, in order of their start.
         skeleton: of the animals.
-        surface: their mesh model.
         spine_mm: size of the first animal, mm.
         pose: (n) its root T_camera_root, angles and scale.
         joints_camera: (n, J, 3) its joints, mm, camera frame.
@@ -218,7 +217,6 @@ class RenderedRecording(Recording):
         self._loss = loss
         self._sides = np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
         self.skeleton = stage.skeleton
-        self.surface = Surface.of(stage.skeleton)
         self.T_arena_camera = T = stage.scene.T_arena_camera
         self.floor = Floor.from_plane(-T.rotation[2], float(T.translation[2]), camera)
         self.spine_mm = stage.skeleton.length

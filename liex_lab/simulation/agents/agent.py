@@ -20,7 +20,7 @@ from liex_lab.scene.height_maps import Patches
 from liex_lab.simulation._sensor_kernels import ANIMAL, UNIT
 from liex_lab.simulation.rendering import Solid, Views
 from liex_lab.simulation.scene import draw_views
-from liex_lab.simulation.sensors import Sensor
+from liex_lab.simulation.sensors import Sensor, draw_units
 from liex_lab.simulation.species import Species
 from liex_lab.simulation.training_patches import floor_views
 
@@ -308,17 +308,13 @@ def draw_camera(
     Returns:
         The camera, a batch of one.
     """
-    camera = sensor.camera.every(stride)
-    focal = rng.uniform(0.98, 1.02) * np.array([camera.fx, camera.fy])
+    unit = replace(sensor, stride=stride)
+    intrinsics, size_px, parameters = draw_units(rng, (unit,), np.zeros(1, np.int64), fur)
+    intrinsics[:, 2:] += size_px / 2.0
     place = draw_views(rng, 1, species.setting)
     place.translation[:] = [0.0, 0.0, height_mm]
-    parameters = replace(sensor, stride=stride).coarse(sensor.draw(rng, 1, fur))
-    size_px = np.array([[camera.width, camera.height]])
     error = rng.standard_normal((1, 3)) * [0.002, 0.002, 0.5 * species.setting.scale]
-    middle = np.array([camera.cx, camera.cy]) + size_px[0] / 2.0
-    intrinsics = np.concatenate([focal, middle])[None]
-    whole = size_px + (2 * (size_px / 2.0)).astype(np.int64)
-    return floor_views(intrinsics, whole, place, parameters, error)
+    return floor_views(intrinsics, 2 * size_px, place, parameters, error)
 
 
 def render_agent(
