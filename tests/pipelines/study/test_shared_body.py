@@ -68,21 +68,6 @@ def test_the_length_is_the_random_effects_mean(some):
     assert agree("m07", some).spine_mm == pytest.approx(wanted, abs=5.1e-4)
 
 
-@pytest.mark.parametrize(
-    ("lengths", "log_sd", "frames", "shares"),
-    [((80.0, 81.0), 0.1, (10, 90), (0.1, 0.9)), ((78.0, 82.0), 0.01, (10, 100), (0.5, 0.5))],
-)
-def test_sessions_count_by_their_frames_unless_they_differ_by_more_than_their_scatter(
-    lengths, log_sd, frames, shares
-):
-    """Ten times the frames make a session no better witness of what differs between sessions."""
-    few, many = (
-        found(mm, log_sd=log_sd, n_frames=n) for mm, n in zip(lengths, frames, strict=True)
-    )
-    wanted = np.exp(np.dot(shares, np.log(lengths)))
-    assert agree("m07", [few, many]).spine_mm == pytest.approx(wanted, rel=1e-4)
-
-
 def test_a_length_that_is_stated_is_no_finding_and_the_shape_is_shared_all_the_same():
     stated = found(80.0, stated=True, factor=1.2, n=60)
     measured = found(82.0, factor=1.2, n=60)
