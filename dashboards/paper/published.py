@@ -87,6 +87,7 @@ DEVIATIONS = (
 HAND = (
     "Rendered hands: mean over 23 joints, root estimated, any side shown. Published: 14 points; "
     "of Lie-X with the root given, that is with the palm placed on the true palm; and hands that "
-    "show their palm. Bone lengths and 55 % of the training postures of every row come from labels "
-    "of NYU test frames 1 to 2440, whose source states no licence."
+    "show their palm. Rows measured before 28 November 2026 learned from bones and postures of "
+    "which a part came from labels of NYU test frames 1 to 2440; all others, and ours, rest on "
+    "published anatomy."
 )
