@@ -106,7 +106,7 @@ def test_actions_are_told_on_change_with_word_and_place(messages, session):
     states = messages["/actions"]
     words = [state["action"] for _, state in states]
     assert words == ["walk", "", "walk", "rear", "walk", ""]
-    assert [state["index"] for _, state in states] == [2, -1, 2, 0, 2, -1]
+    assert [state["index"] for _, state in states] == [3, -1, 3, 0, 3, -1]
     first = int(MOUSE.times_ns[0])
     starts = [round(start * 1e9) + first for start in session.bouts["start_s"]]
     assert [time for time, state in states if state["action"]] == starts
