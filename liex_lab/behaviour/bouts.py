@@ -460,7 +460,7 @@ def raw_labels(
     raised, hunched = np.full((2, len(speed)), np.nan)
     if "nose_over_rump_mm" in kinematics:
         reach = kinematics["reach_mm"].to_numpy(float) / spine_mm
-        hunched[speed < rules.groom_below_mm_s] = -reach[speed < rules.groom_below_mm_s]
+        hunched = np.where(speed < rules.groom_below_mm_s, -reach, np.nan)
         nose = kinematics["nose_height_mm"].to_numpy(float)
         raised = nose - of_known(np.median, nose - kinematics["nose_over_rump_mm"].to_numpy(float))
     rear_mm = rules.rear_mm(spine_mm)
