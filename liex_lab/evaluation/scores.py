@@ -86,6 +86,25 @@ def is_flipped(joints: Array, truth: Array, tip: int) -> Mask:
     return np.asarray(np.einsum("nd,nd->n", along, true) < 0)
 
 
+def along_body(joints: Array, truth: Array, rows: Mask) -> tuple[Array, Array, Array]:
+    """Errors along the body, and their constant: where a joint lies along a body is a convention.
+
+    Args:
+        joints: (n, J, 3) measured joints, mm, in a frame whose xy is the plane of the floor, or
+            the image of a camera above it.
+        truth: (n, J, 3) true joints, mm, in the same frame.
+        rows: (n,) bool, frames that determine the constant.
+
+    Returns:
+        Directions (n, J, 2) of the true spine, unit vectors from base to tip; errors (n, J) along
+        them, mm; their medians (J,) over `rows`, mm.
+    """
+    way = np.gradient(truth[..., :2], axis=1)
+    way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+    along = ((joints - truth)[..., :2] * way).sum(axis=-1)
+    return way, along, np.nanmedian(along[rows], axis=0)
+
+
 @dataclass(frozen=True)
 class PoseErrors(Rows):
     """Errors of measured against true poses in n frames.

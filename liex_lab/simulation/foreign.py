@@ -12,7 +12,9 @@ follow from the number of the body; motion, scene and noise also from the seed. 
 form of docs/reference/truth.md.
 """
 
+from collections.abc import Mapping
 from functools import cached_property
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -23,9 +25,11 @@ from scipy.special import logsumexp, softmax
 
 from liex_lab.body._skinning_kernels import joined_faces
 from liex_lab.body.shape import render_mesh
+from liex_lab.errors import LiexError, refuse
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording
+from liex_lab.simulation.recording import TrueAnimal
 from liex_lab.simulation.scene import SPHERE_TUBE, SceneSpec, SimulatedScene, rounded
 from liex_lab.simulation.species import TANK
 
@@ -59,13 +63,17 @@ _SEGMENT = 0.05  # of the spine, body lengths
 SEALED_BODY: Final = 953_200  # bodies from here on are reserved for the sealed part
 
 
-# lengths in mm; rear end of the spine and width of the blend in body lengths; frames per second;
+TRUTH_FORM: Final = "docs/reference/truth.md describes the form"
+
+# lengths in mm; factor of the height of limbs, which lift the belly off the floor; rear end of the
+# spine and width of the blend in body lengths; frames per second;
 # speckle at the floor, mm; cameras and steps of depth, mm, of the bodies in turn
 KINDS: Final[dict[str, dict[str, Any]]] = {
     "mouse": {
         "parts": _MOUSE,
         "n_bodies": 4,
         "length_mm": (54.0, 84.0),
+        "stance": (1.0, 1.7),
         "rear": -0.75,
         "blend": 0.018,
         "setting": SceneSpec(camera_mm=(480.0, 780.0)),
@@ -81,6 +89,7 @@ KINDS: Final[dict[str, dict[str, Any]]] = {
         "parts": _FISH,
         "n_bodies": 3,
         "length_mm": (26.0, 34.0),
+        "stance": (1.0, 1.0),
         "rear": 0.0,
         "blend": 0.006,
         "setting": TANK,
@@ -112,9 +121,12 @@ class ForeignRecording(Recording):
         self._seed = [int(self._floats), body, seed]
         own, rng = (np.random.default_rng(self._seed[:n]) for n in (2, 3))
         self.length_mm = float(own.uniform(*kind["length_mm"]))
-        vertices, self._faces = _mesh(_drawn(own, kind["parts"]), kind["blend"])
+        parts = _drawn(own, kind["parts"])
         self._fur, self._grain_px = own.uniform([0.1, 0.7], [0.5, 1.8])
         self._speckle_mm = own.uniform(*kind["speckle_mm"])
+        limbs = (parts[:, 1] != 0) & (parts[:, 2] < 0)
+        parts[np.ix_(limbs, [2, 5])] *= own.uniform(*kind["stance"])
+        vertices, self._faces = _mesh(parts, kind["blend"])
         self._step_mm, camera = (kind[of][body % len(kind[of])] for of in ("steps_mm", "cameras"))
         self._scene = SimulatedScene.draw(rng, camera, self.length_mm, kind["setting"])
         ends = np.arange(round(kind["rear"] / _SEGMENT), round(1.0 / _SEGMENT)) * _SEGMENT
@@ -210,6 +222,84 @@ class ForeignRecording(Recording):
         each = zip(bodies, joints, strict=True)
         skins = np.stack([_through(body, self._faces, self.camera, here) for body, here in each])
         return {"joints": joints, "surface_mm": skins[..., 0], "thickness_mm": np.ptp(skins, -1)}
+
+    def animal(self, shares: Array) -> TrueAnimal:
+        """The truth at some places along the body; `shares` as in `truth_of`."""
+        return truth_of(self.truth, self.name, self, shares)
+
+
+def truth_of(
+    arrays: Mapping[str, Any], name: str, recording: Recording, shares: Array
+) -> TrueAnimal:
+    """The truth in the arrays of a truth file, at some places along its curve.
+
+    The joints of the result have z in the middle between the upper and the lower skin; they are
+    NaN where it is unknown.
+
+    Args:
+        arrays: by name.
+        name: of the file, in errors.
+        recording: whose frames it is of.
+        shares: (K,) places as shares of the length, from 0 to 1.
+
+    Raises:
+        LiexError: an array is missing or has another shape, there is no number in it, or the joints
+            are not in view of the recording's camera.
+        ValueError: an array is not of numbers, or an optional one has another shape.
+    """
+    needed, n, camera = ("joints", "surface_mm", "thickness_mm"), len(recording), recording.camera
+    if lacking := [one for one in needed if one not in arrays]:
+        raise LiexError(f"{name} lacks the array {', '.join(lacking)}; {TRUTH_FORM}")
+    joints, surface, thickness = (np.asarray(arrays[one], float) for one in needed)
+    refuse(
+        LiexError,
+        (
+            joints.ndim != 3 or joints.shape[1] < 2 or joints.shape[2] != 3,
+            f"{name}: joints should be frames x joints x (x, y, z) in mm, of at least two joints, "
+            f"got {joints.shape}; {TRUTH_FORM}",
+        ),
+        (
+            len(joints) != n,
+            f"{name} has {len(joints)} frames and its recording {n}; state the truth of each frame",
+        ),
+        (
+            {surface.shape, thickness.shape} != {joints.shape[:2]},
+            f"{name}: surface_mm and thickness_mm should have a number for each frame and joint of "
+            f"joints, {joints.shape[:2]}, got {surface.shape} and {thickness.shape}; {TRUTH_FORM}",
+        ),
+    )
+    middle = surface + thickness / 2.0
+    known = np.isfinite(joints).all(axis=-1) & np.isfinite(middle)
+    if not known.any():
+        raise LiexError(
+            f"{name}: no joint has finite joints, surface_mm, thickness_mm; {TRUTH_FORM}"
+        )
+    steps = np.diff(joints, axis=1, prepend=joints[:, :1])
+    arc = np.cumsum(np.linalg.norm(steps, axis=-1), axis=1)
+    length = float(np.nanmedian(np.asarray(arrays.get("arc_mm", arc[:, -1]), float)))
+    uv = camera.project(joints[known])
+    inside = ((uv > -0.5) & (uv < np.array([camera.width, camera.height]) - 0.5)).all(axis=-1)
+    refuse(
+        LiexError,
+        (
+            inside.mean() < 0.5,
+            f"{name}: most joints lie outside the view of the recording's camera; they should be "
+            "in mm in its frame (x right, y down, z away)",
+        ),
+        (
+            np.median(np.abs(middle - joints[..., 2])[known]) > length,
+            f"{name}: surface_mm + thickness_mm / 2 lies more than a body length from the z of the "
+            "joints; they should be depths from the camera and thicknesses, in mm",
+        ),
+    )
+    values = np.stack([joints[..., 0], joints[..., 1], middle], axis=-1)
+    points = np.full((n, len(shares), 3), np.nan)
+    for i, k in product(np.flatnonzero((arc[:, -1] > 0) & known.any(axis=1)), range(3)):
+        ok = np.isfinite(values[i, :, k])
+        at, ends = arc[i, ok] / arc[i, -1], {"left": np.nan, "right": np.nan}
+        points[i, :, k] = np.interp(shares, at, values[i, ok, k], **ends)
+    visible = np.asarray(arrays.get("visible_fraction", 1.0), float)
+    return TrueAnimal(length, points, np.broadcast_to(visible, n))
 
 
 def _wander(rng: np.random.Generator, time_s: Array, n: int) -> Array:

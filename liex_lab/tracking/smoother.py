@@ -127,15 +127,17 @@ class MotionParameters:
             the residual between body and depth over the length, and for the standard deviation of
             the logarithm of the sizes estimated from single frames.
         usual_stretch: that relative error in a session for which neither is available.
-        unseen_height: standard deviation, over the length, of the height of all joints together: a
-            camera observes the animal's back, and the depth of the midline below it depends on the
-            animal's build.
+        unseen_height: standard deviation, over the length, of the height of each joint, or one for
+            all: a camera observes the animal's back, and the depth of the midline below it depends
+            on the animal's build.
         unseen_shift: the same for the position of the joints along the body.
         root_calibration: remaining calibration factors of the root's rotation about (3) and
             position along (3) its own axes.
         bend_calibration: likewise, of the other joints' angles about their x, y and z axis.
         joint_calibration: factors of the joints' standard deviations along each axis, one per
             joint; () leaves them unchanged.
+        expected_share: share of the stretch and of the unseen part in the predicted error. Their
+            spreads are those of the family of bodies with the largest errors.
     """
 
     position_error: tuple[float, float, float]
@@ -150,11 +152,12 @@ class MotionParameters:
     calibration: tuple[tuple[float, float], ...]
     stretch: tuple[float, float] = (0.0, 0.0)
     usual_stretch: float = 0.0
-    unseen_height: float = 0.0
+    unseen_height: tuple[float, ...] = (0.0,)
     unseen_shift: float = 0.0
     root_calibration: tuple[float, float, float, float, float, float] = (1.0,) * 6
     bend_calibration: tuple[float, float, float] = (1.0,) * 3
     joint_calibration: tuple[float, ...] = ()
+    expected_share: float = 1.0
 
     def stretch_sd(self, blur: float, size_spread: float) -> float:
         """Standard deviation of the relative error of an animal's lengths, see `Subject`.
@@ -207,7 +210,10 @@ class TrackingParameters:
             return TrackingParameters.from_table(known[name])
         usual = TrackingParameters.from_table(known[_USUAL])
         # the joints differ
-        return replace(usual, motion=replace(usual.motion, joint_calibration=()))
+        height = (float(np.mean(usual.motion.unseen_height)),)
+        return replace(
+            usual, motion=replace(usual.motion, joint_calibration=(), unseen_height=height)
+        )
 
     @staticmethod
     def from_table(table: dict[str, Any]) -> TrackingParameters:

@@ -480,7 +480,7 @@ def write_curve(
     away = stretch_of(stretch, curve.joints)
     # two of three axes: up, and along the body, at any heading
     unseen = subject.unseen or (motion.unseen_height, motion.unseen_shift)
-    height, shift = (share * subject.length_mm for share in unseen)
+    height, shift = (np.asarray(share) * subject.length_mm for share in unseen)
     track.sd_mm[:] = np.hypot(
         (curve.error_mm / ERROR_PER_SD)[:, None] * np.array(subject.joint_share), away
     ) * (motion.joint_calibration or 1.0)
@@ -488,11 +488,11 @@ def write_curve(
     track.sd_xy_mm[:] = np.hypot(track.sd_mm, np.sqrt(0.5) * shift)
     track.sd_z_mm[:] = np.hypot(track.sd_mm, height)
     # of |x| for a Gaussian x, 0.8 is the mean over the standard deviation, sqrt(2 / pi)
-    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), 0.8 * np.hypot(height, shift))
-    track.predicted_error_mm[:] = np.hypot(curve.error_mm, constant)
+    constant = np.hypot(ERROR_PER_SD * away.mean(axis=1), 0.8 * np.hypot(height, shift).mean())
+    track.predicted_error_mm[:] = np.hypot(curve.error_mm, motion.expected_share * constant)
     calibration = np.array(motion.root_calibration)
     R = pose.root.rotation
-    up = height * R[:, 2]  # of the arena, in the root's own frame
+    up = height.flat[0] * R[:, 2]  # of the arena, in the root's own frame
     along = curve.joints[:, 0] - curve.joints[:, subject.skeleton.tip]
     along *= shift / np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
     along = np.einsum("nji,nj->ni", R, along)

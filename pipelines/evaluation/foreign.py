@@ -8,8 +8,6 @@ constant per joint, and in depth with the middle between upper and lower skin.
 """
 
 import hashlib
-from collections.abc import Mapping
-from itertools import product
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
@@ -18,19 +16,18 @@ import numpy as np
 
 from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.errors import LiexError, refuse
-from liex_lab.evaluation.scores import FAR, MeasuredIndividual, interval95, is_flipped
+from liex_lab.evaluation.scores import FAR, MeasuredIndividual, along_body, interval95, is_flipped
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.foreign import KINDS, SEALED_BODY, ForeignRecording
+from liex_lab.simulation.foreign import KINDS, SEALED_BODY, TRUTH_FORM, ForeignRecording, truth_of
 from liex_lab.simulation.recording import TrueAnimal
 
 from ..build import plan_of
 from .scenes import run_product
 
 FOREIGN_SEEDS: Final = (1, 953_200_601)  # of motion, scene and noise; the second is sealed
-_FORM = "docs/reference/truth.md describes the form"
 FOREIGN_PROTOCOL = (
     "Bodies that do not come from the generator of the training images, each recording measured as "
     "`liex run` does and its tables read back; compared in the camera frame. The truth's joints "
@@ -143,7 +140,7 @@ def own_cases(animal: str, n_frames: int, sealed: bool, shares: Array) -> list[F
         recording = ForeignRecording(animal, int(body), FOREIGN_SEEDS[sealed], n_frames)
         name = f"{recording.name} {n_frames}"  # determines the content, which need not be hashed
         recording.files.known_digest = hashlib.sha256(name.encode()).hexdigest()
-        cases.append((recording, truth_of(recording.truth, recording.name, recording, shares)))
+        cases.append((recording, recording.animal(shares)))
     return cases
 
 
@@ -181,7 +178,7 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
             with np.load(path, allow_pickle=False) as file:
                 body = truth_of(dict(file), path.name, recording, shares)
         except (OSError, ValueError, EOFError, TypeError, BadZipFile) as error:
-            raise LiexError(f"{path} should be a truth file, but: {error}; {_FORM}") from None
+            raise LiexError(f"{path} should be a truth file, but: {error}; {TRUTH_FORM}") from None
         if low <= body.spine_mm <= high:
             cases.append((recording, body))
         else:
@@ -195,78 +192,6 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
             f"{'; '.join(skipped) or 'check the path'}"
         )
     return cases, skipped
-
-
-def truth_of(
-    arrays: Mapping[str, Any], name: str, recording: Recording, shares: Array
-) -> TrueAnimal:
-    """The truth in the arrays of a truth file, at some places along its curve.
-
-    The joints of the result have z in the middle between the upper and the lower skin; they are
-    NaN where it is unknown.
-
-    Args:
-        arrays: by name.
-        name: of the file, in errors.
-        recording: whose frames it is of.
-        shares: (K,) places as shares of the length, from 0 to 1.
-
-    Raises:
-        LiexError: an array is missing or has another shape, there is no number in it, or the joints
-            are not in view of the recording's camera.
-        ValueError: an array is not of numbers, or an optional one has another shape.
-    """
-    needed, n, camera = ("joints", "surface_mm", "thickness_mm"), len(recording), recording.camera
-    if lacking := [one for one in needed if one not in arrays]:
-        raise LiexError(f"{name} lacks the array {', '.join(lacking)}; {_FORM}")
-    joints, surface, thickness = (np.asarray(arrays[one], float) for one in needed)
-    refuse(
-        LiexError,
-        (
-            joints.ndim != 3 or joints.shape[1] < 2 or joints.shape[2] != 3,
-            f"{name}: joints should be frames x joints x (x, y, z) in mm, of at least two joints, "
-            f"got {joints.shape}; {_FORM}",
-        ),
-        (
-            len(joints) != n,
-            f"{name} has {len(joints)} frames and its recording {n}; state the truth of each frame",
-        ),
-        (
-            {surface.shape, thickness.shape} != {joints.shape[:2]},
-            f"{name}: surface_mm and thickness_mm should have a number for each frame and joint of "
-            f"joints, {joints.shape[:2]}, got {surface.shape} and {thickness.shape}; {_FORM}",
-        ),
-    )
-    middle = surface + thickness / 2.0
-    known = np.isfinite(joints).all(axis=-1) & np.isfinite(middle)
-    if not known.any():
-        raise LiexError(f"{name}: no joint has finite joints, surface_mm, thickness_mm; {_FORM}")
-    steps = np.diff(joints, axis=1, prepend=joints[:, :1])
-    arc = np.cumsum(np.linalg.norm(steps, axis=-1), axis=1)
-    length = float(np.nanmedian(np.asarray(arrays.get("arc_mm", arc[:, -1]), float)))
-    uv = camera.project(joints[known])
-    inside = ((uv > -0.5) & (uv < np.array([camera.width, camera.height]) - 0.5)).all(axis=-1)
-    refuse(
-        LiexError,
-        (
-            inside.mean() < 0.5,
-            f"{name}: most joints lie outside the view of the recording's camera; they should be "
-            "in mm in its frame (x right, y down, z away)",
-        ),
-        (
-            np.median(np.abs(middle - joints[..., 2])[known]) > length,
-            f"{name}: surface_mm + thickness_mm / 2 lies more than a body length from the z of the "
-            "joints; they should be depths from the camera and thicknesses, in mm",
-        ),
-    )
-    values = np.stack([joints[..., 0], joints[..., 1], middle], axis=-1)
-    points = np.full((n, len(shares), 3), np.nan)
-    for i, k in product(np.flatnonzero((arc[:, -1] > 0) & known.any(axis=1)), range(3)):
-        ok = np.isfinite(values[i, :, k])
-        at, ends = arc[i, ok] / arc[i, -1], {"left": np.nan, "right": np.nan}
-        points[i, :, k] = np.interp(shares, at, values[i, ok, k], **ends)
-    visible = np.asarray(arrays.get("visible_fraction", 1.0), float)
-    return TrueAnimal(length, points, np.broadcast_to(visible, n))
 
 
 def body_figures(truth: TrueAnimal, one: MeasuredIndividual, skeleton: Skeleton) -> dict[str, Any]:
@@ -293,14 +218,11 @@ def body_figures(truth: TrueAnimal, one: MeasuredIndividual, skeleton: Skeleton)
     joints, true, expected = (
         each[known] for each in (one.joints_camera, truth.joints_camera, one.expected_mm)
     )
-    way = np.gradient(true[..., :2], axis=1)
-    way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
     off = joints - true
-    across = np.abs(off[..., 0] * way[..., 1] - off[..., 1] * way[..., 0])
-    along = (off[..., :2] * way).sum(axis=-1)
     flipped = is_flipped(joints[..., :2], true[..., :2], skeleton.tip)
     usual = rows & ~flipped if (rows & ~flipped).any() else rows
-    constant = np.median(along[usual], axis=0)
+    way, along, constant = along_body(joints, true, usual)
+    across = np.abs(off[..., 0] * way[..., 1] - off[..., 1] * way[..., 0])
     off[..., :2] -= constant[:, None] * way
     error = np.nanmean(np.linalg.norm(off, axis=-1), axis=1)
     inside = np.abs(off @ one.R_arena_camera.T) <= 1.645 * one.sd_mm[known]

@@ -5,12 +5,17 @@ frame by frame. These fits follow on the observations:
 
 - Calibration factors of the joints (`calibration`) at three levels of the stated error, by
   bisection, together with the standard deviation of the body's stretch over a grid of two
-  coefficients, so that nine errors in ten lie within the 90 % interval, over all sequences and in
-  each of them.
-- The same factors for the root's six coordinates and for the bend angles about three axes, and,
-  over all of these sequences and animals of other builds, one for each joint.
-- The unobservable part of a build, from animals of builds that no forest was trained on: the spread
-  of heights and of positions along the body (`unseen_height`, `unseen_shift`).
+  coefficients, so that nine errors in ten along the floor lie within the 90 % interval, over all
+  families of bodies and in each of them.
+- The same factors for the root's six coordinates and for the bend angles about three axes, and one
+  for each joint.
+- The unobservable part of a build: the spread of heights and of positions along the body
+  (`unseen_height`, `unseen_shift`).
+- The share of a build's part in the predicted error (`expected_share`).
+
+The families are usual bodies on easy and on hard sequences, bodies of builds that no forest was
+trained on, and foreign bodies, which another program renders (`simulation.foreign`). Each has the
+same weight, however many frames it has: an animal in a laboratory is like none of them.
 
 Everything starts from fixed seeds, so `tunings.toml` is byte-identical on every run.
 """
@@ -28,10 +33,12 @@ from numpy.typing import NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.evaluation.scores import along_body
 from liex_lab.geometry import SE3, so3
 from liex_lab.plan import Plan
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation import simulator
+from liex_lab.simulation.foreign import KINDS, ForeignRecording
 from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.tracking import curve, trust
 from liex_lab.tracking.observations import Observations
@@ -45,6 +52,7 @@ from .pose_model import estimator_of
 Knots = tuple[tuple[float, float], ...]
 
 BUILD_SEEDS = tuple(range(201, 230))  # of animals of other builds
+FOREIGN_BODIES = tuple(range(100, 112))  # in no split
 _Z90 = 1.645
 
 
@@ -53,11 +61,11 @@ class Measured:
     """A measured rendered sequence: observations, subject and truth.
 
     Attributes:
-        kind: `easy`, `hard` or `other`.
+        kind: its family of bodies: `easy`, `hard`, `other` or `foreign`.
         observations: hypotheses of all n frames, arena frame.
         subject: the animal and its camera.
-        pose: (n) true poses, in the same arena frame.
-        truth: (n, J, 3) true joints, mm, in the same arena frame.
+        pose: (n) true poses, in the same arena frame; None of a foreign body.
+        truth: (n, J, 3) true joints, mm, in the same arena frame; NaN where unknown.
         blur: median distance of body and depth over the body's length, see `FrameTracker`.
         size_spread: standard deviation of the log size estimated by frame, see `FrameTracker`.
     """
@@ -65,7 +73,7 @@ class Measured:
     kind: str
     observations: Observations
     subject: Subject
-    pose: Pose
+    pose: Pose | None
     truth: Array
     blur: float
     size_spread: float
@@ -102,10 +110,15 @@ def train_tracking(
         for kind in ("easy", "hard")
         for seed in seeds or range(101, 109)
     ]
-    tuning = calibrate_joints(measured, TrackingParameters.of(animal))
+    families = [
+        *measured,
+        *other_builds(animal, progress, seeds or BUILD_SEEDS),
+        *foreign_bodies(animal, progress, seeds or FOREIGN_BODIES),
+    ]
+    tuning = calibrate_joints(families, TrackingParameters.of(animal))
     tuning = calibrate_roots(measured, tuning)
-    builds = other_builds(animal, progress, seeds or BUILD_SEEDS)
-    tuning = calibrate_each_joint([*measured, *builds], calibrate_builds(builds, tuning))
+    for calibrate in (calibrate_each_joint, calibrate_builds, calibrate_expected):
+        tuning = calibrate(families, tuning)
     out.write_text(tunings_with(animal, tuning), encoding="utf-8")
     return out
 
@@ -155,11 +168,32 @@ def other_builds(
     return [observed(estimator, plan, "other", one, progress) for one in recordings]
 
 
+def foreign_bodies(
+    animal: str, progress: Progress = silent, bodies: Sequence[int] = FOREIGN_BODIES
+) -> list[Measured]:
+    """Recordings of foreign bodies, measured frame by frame.
+
+    Args:
+        animal: a bundled animal's name, or the path of a skeleton's TOML.
+        progress: called frame by frame.
+        bodies: their numbers.
+
+    Returns:
+        One per body; [] if there are none of the animal.
+    """
+    if animal not in KINDS:
+        return []
+    estimator = estimator_of(animal, "default", progress)
+    plan = plan_of(animal)
+    recordings = [ForeignRecording(animal, body, body, 120) for body in bodies]
+    return [observed(estimator, plan, "foreign", one, progress) for one in recordings]
+
+
 def observed(
     estimator: PoseEstimator,
     plan: Plan,
     kind: str,
-    recording: RenderedRecording,
+    recording: RenderedRecording | ForeignRecording,
     progress: Progress = silent,
 ) -> Measured:
     """Measure a rendered recording frame by frame; background and size are estimated as in a run.
@@ -182,14 +216,20 @@ def observed(
     for frames in recording.chunks(32):
         progress(frames[0].index, len(recording), f"measuring {recording.name}")
         parts.append(tracker.observe(frames))
-    T = scene.floor.T_arena_camera @ recording.T_arena_camera.inverse()
-    pose = recording.pose.moved(scene.floor.T_arena_camera)
+    T = scene.floor.T_arena_camera
+    if isinstance(recording, RenderedRecording):
+        pose = recording.pose.moved(T)
+        truth = T @ recording.joints_camera
+    else:
+        pose = None
+        skeleton = estimator.skeleton
+        truth = T @ recording.animal(skeleton.reach / skeleton.length).joints_camera
     return Measured(
         kind,
         Observations.join(parts),
         tracker.subject,
         pose,
-        T @ recording.joints_arena,
+        truth,
         tracker.blur,
         tracker.size_spread,
     )
@@ -209,14 +249,16 @@ class _Claim:
     """Stated and true errors of a sequence's frames that have a pose, over the animal's length.
 
     Attributes:
+        kind: see `Measured`.
         blur: see `Measured`.
         size_spread: see `Measured`.
         stated: (n,) stated mean joint error.
         sd: (n, J) stated standard deviation of each joint.
         away: (n, J) standard deviation that a stretch of 1 gives each joint, see `stretch_of`.
-        deviation: (n, J, 3) absolute errors of the joints.
+        deviation: (n, J, 2) absolute errors of the joints along the floor.
     """
 
+    kind: str
     blur: float
     size_spread: float
     stated: Array
@@ -229,7 +271,7 @@ class _Claim:
         return float(np.hypot(per_blur * self.blur, per_spread * self.size_spread))
 
     def over(self, knots: Knots, stretch: tuple[float, float]) -> Array:
-        """Errors (n, J, 3) over their calibrated standard deviations.
+        """Errors (n, J, 2) over their calibrated standard deviations.
 
         Args:
             knots: (stated error, factor) pairs, interpolated over the logarithm.
@@ -249,28 +291,28 @@ def calibrate_joints(
 ) -> TrackingParameters:
     """The tuning with factors and stretch for which the joints' 90 % intervals cover 90 %.
 
-    Over a grid of both stretch coefficients (`_PER_BLUR` x `_PER_SPREAD`) the factors are fitted to
-    all sequences together; the chosen pair minimises, over the sequences, the mean squared
-    logarithm of the factor that each would still need.
+    Over a grid of both stretch coefficients the factors are fitted to all sequences together; the
+    chosen pair minimises, over the sequences, the mean squared logarithm of the factor that each
+    would still need. Families of bodies weigh the same in both.
     """
     plain = with_motion(
         tuning,
         calibration=((1.0, 1.0),),
         stretch=(0.0, 0.0),
         usual_stretch=0.0,
-        unseen_height=0.0,
+        unseen_height=(0.0,),
         unseen_shift=0.0,
         joint_calibration=(),
     )
     claims = [_claim(each, plain) for each in measured]
+    weight = _weight_of([claim.kind for claim in claims])
     best = (0.0, 0.0)
     least = np.inf
     # grids of the stretch's coefficients, see `MotionParameters.stretch`
     for stretch in product(np.arange(0.0, 6.5, 0.5).tolist(), np.arange(0.0, 3.5, 0.5).tolist()):
         knots = calibration_knots(claims, stretch)
-        apart = float(
-            np.mean([np.log(_nine_in_ten(claim.over(knots, stretch))) ** 2 for claim in claims])
-        )
+        needed = [_nine_in_ten(claim.over(knots, stretch)) for claim in claims]
+        apart = float(np.average(np.log(needed) ** 2, weights=weight))
         if apart < least:
             best = stretch
             least = apart
@@ -287,114 +329,158 @@ def _claim(each: Measured, plain: TrackingParameters) -> _Claim:
     """Stated and true errors of a sequence tracked with factors of 1 and no stretch."""
     length = each.subject.length_mm
     track = _track(replace(each, subject=replace(each.subject, stretch_sd=0.0)), plain)
-    there = track.posed
+    there, off = _errors(each, track)
     joints = track.joints_mm[there]
     return _Claim(
+        each.kind,
         each.blur,
         each.size_spread,
         track.predicted_error_mm[there] / length,
         track.sd_mm[there] / length,
         trust.stretch_of(1.0, joints) / length,
-        np.abs(joints - each.truth[there]) / length,
+        np.abs(off[..., :2]) / length,
     )
 
 
-def calibrate_builds(builds: Sequence[Measured], tuning: TrackingParameters) -> TrackingParameters:
+def _errors(each: Measured, track: Track) -> tuple[NDArray[np.bool_], Array]:
+    """Frames (n,) with a pose and a truth, and the errors (k, J, 3) mm of the joints in these.
+
+    Where a foreign body's joints lie along it is a convention: the constant is subtracted.
+    """
+    there = track.posed & np.isfinite(each.truth[..., :2]).all(axis=(1, 2))
+    joints, truth = track.joints_mm[there], each.truth[there]
+    off = joints - truth
+    if each.pose is None:
+        way, _, constant = along_body(joints, truth, np.ones(len(off), np.bool_))
+        off[..., :2] -= constant[:, None] * way
+    return there, off
+
+
+def _weight_of(kinds: Sequence[str]) -> Array:
+    """Weights (n,) of things of n kinds, with the same sum for each kind."""
+    _, kind, count = np.unique(kinds, return_inverse=True, return_counts=True)
+    return np.asarray(1.0 / count[kind])
+
+
+def _quantile(values: Array, share: float, weight: Array) -> float:
+    """The quantile of weighted values (n,), those that are NaN left out."""
+    order = np.argsort(values)[: np.isfinite(values).sum()]
+    below = np.cumsum(weight[order])
+    return float(np.interp(share * below[-1], below, values[order])) if len(order) else 0.0
+
+
+def calibrate_builds(
+    measured: Sequence[Measured], tuning: TrackingParameters
+) -> TrackingParameters:
     """The tuning with the unobservable part of a build, `unseen_height` and `unseen_shift`.
 
     A joint whose error e, upwards or along the body, is more than 1.645 sd needs an additional
-    spread of sqrt((e / 1.645)^2 - sd^2); the animal's spread is the 90 % quantile over all joints.
+    spread of sqrt((e / 1.645)^2 - sd^2). The spread of each joint's height is the 90 % quantile in
+    the family of bodies that needs most; the spread along the body is that over all joints.
     """
-    plain = with_motion(tuning, unseen_height=0.0, unseen_shift=0.0)
-    upwards = [np.zeros(1)]
-    lengthways = [np.zeros(1)]
-    for each in builds:
-        track = _track(each, plain)
-        there = track.posed
-        truth = each.truth[there]
-        along = truth[:, 0] - truth[:, each.subject.skeleton.tip]
+    plain = with_motion(tuning, unseen_height=(0.0,), unseen_shift=0.0)
+    upwards: dict[str, list[Array]] = {}
+    lengthways: dict[str, list[Array]] = {}
+    for each in measured:
+        track = _track(_stretched(each, plain), plain)
+        there, off = _errors(each, track)
+        along = each.truth[there, 0, :2] - each.truth[there, each.subject.skeleton.tip, :2]
         along /= np.linalg.norm(along, axis=1)[:, None]
-        off = track.joints_mm[there] - truth
         known = track.sd_mm[there] ** 2
         for needed, one in (
             (upwards, off[..., 2]),
-            (lengthways, np.einsum("njk,nk->nj", off, along)),
+            (lengthways, np.einsum("njk,nk->nj", off[..., :2], along)),
         ):
-            needed.append((((one / _Z90) ** 2 - known) / each.subject.length_mm**2).ravel())
-    height, shift = (
-        round(float(np.sqrt(max(np.quantile(np.concatenate(needed), 0.9), 0.0))), 4)
-        for needed in (upwards, lengthways)
+            variance = ((one / _Z90) ** 2 - known) / each.subject.length_mm**2
+            needed.setdefault(each.kind, []).append(variance)
+    if not upwards:
+        return plain
+    height = [np.nanquantile(np.concatenate(one), 0.9, axis=0) for one in upwards.values()]
+    shift = [np.nanquantile(np.concatenate(one), 0.9) for one in lengthways.values()]
+    return with_motion(
+        tuning,
+        unseen_height=tuple(np.sqrt(np.max(height, axis=0).clip(0.0)).round(4).tolist()),
+        unseen_shift=round(float(np.sqrt(max(*shift, 0.0))), 4),
     )
-    return with_motion(tuning, unseen_height=height, unseen_shift=shift)
+
+
+def _stretched(each: Measured, tuning: TrackingParameters) -> Measured:
+    """A sequence with the error of its lengths that a run would state."""
+    stretch_sd = tuning.motion.stretch_sd(each.blur, each.size_spread)
+    return replace(each, subject=replace(each.subject, stretch_sd=stretch_sd))
 
 
 def calibrate_each_joint(
     measured: Sequence[Measured], tuning: TrackingParameters
 ) -> TrackingParameters:
-    """The tuning with a factor (`joint_calibration`) for joints whose 90 % intervals are far off.
+    """The tuning with a factor for each joint (`joint_calibration`).
 
-    The factors of `calibrate_joints` are common to all joints, so some intervals are too wide and
-    others too narrow. A joint's own factor is as close to 1 as possible while its intervals cover
-    85 to 96 % of the coordinates in each kind of sequences; if no factor does, it is the geometric
-    mean of the bounds. If the unobservable part of a build dominates an animal's intervals
-    (`unseen_height`, `unseen_shift`), they stay as they are.
+    The factors of `calibrate_joints` are common to all joints, and right in the mean over families
+    of bodies. With a joint's own factor, its 90 % intervals cover 90 % of the coordinates along the
+    floor in the family in which they cover least.
     """
-    plain = with_motion(tuning, joint_calibration=())
-    if tuning.motion.unseen_height or tuning.motion.unseen_shift:
-        return plain
-    off: dict[str, list[Array]] = {}
+    plain = with_motion(tuning, joint_calibration=(), unseen_height=(0.0,), unseen_shift=0.0)
+    over: dict[str, list[Array]] = {}
     for each in measured:
-        track = _track(
-            replace(
-                each,
-                subject=replace(
-                    each.subject, stretch_sd=plain.motion.stretch_sd(each.blur, each.size_spread)
-                ),
-            ),
-            plain,
+        track = _track(_stretched(each, plain), plain)
+        there, off = _errors(each, track)
+        over.setdefault(each.kind, []).append(np.abs(off[..., :2]) / track.sd_mm[there][..., None])
+    needed = [np.quantile(np.concatenate(z), 0.9, axis=(0, 2)) / _Z90 for z in over.values()]
+    return with_motion(tuning, joint_calibration=tuple(np.max(needed, axis=0).round(3).tolist()))
+
+
+def calibrate_expected(
+    measured: Sequence[Measured], tuning: TrackingParameters
+) -> TrackingParameters:
+    """The tuning with the share of a build's part in the predicted error (`expected_share`).
+
+    With it, the predicted error is right in the median. Families of bodies weigh the same.
+    """
+    shares: list[Array] = []
+    kinds: list[str] = []
+    for each in measured:
+        without, full = (
+            _track(_stretched(each, one), one)
+            for one in (with_motion(tuning, expected_share=share) for share in (0.0, 1.0))
         )
-        there = track.posed
-        off.setdefault(each.kind, []).append(
-            np.abs(track.joints_mm[there] - each.truth[there]) / track.sd_mm[there][..., None]
-        )
-    # bounds of the coverage of each joint's 90 % intervals, by kind
-    low, high = (
-        np.stack([np.quantile(np.concatenate(z), held, axis=(0, 2)) for z in off.values()]) / _Z90
-        for held in (0.85, 0.96)
-    )
-    least, most = low.max(axis=0), high.min(axis=0)
-    factor = np.where(least > most, np.sqrt(least * most), np.clip(1.0, least, most))
-    return with_motion(plain, joint_calibration=tuple(factor.round(3).tolist()))
+        there, off = _errors(each, full)
+        error_mm = np.nanmean(np.linalg.norm(off, axis=-1), axis=1)
+        least, most = (one.predicted_error_mm[there] for one in (without, full))
+        shares.append(np.sqrt((error_mm**2 - least**2).clip(0.0) / (most**2 - least**2 + 1e-9)))
+        kinds += [each.kind] * len(off)
+    share = _quantile(np.concatenate(shares), 0.5, _weight_of(kinds))
+    return with_motion(tuning, expected_share=round(share, 3))
 
 
 def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) -> Knots:
     """`MotionParameters.calibration`: factors at three levels of the stated error, by bisection.
 
-    The frames are split into 3 groups of equal size by their stated error. For each, f is the
-    factor at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2).
+    The frames are split into 3 groups of equal weight by their stated error. For each, f is the
+    factor at which nine errors in ten lie within 1.645 sqrt((f sd)^2 + stretch^2). Larger errors
+    than these are hardly calibrated, so the factor rises to 1 at an error of the animal's length.
 
     Args:
         claims: stated and true errors of all sequences.
         stretch: coefficients of blur and of size spread.
 
     Returns:
-        (median stated error over the length, factor) for each group, in rising order.
+        (median stated error over the length, factor) for each group, in rising order, and for an
+        error of 1.
     """
     stated, sd, deviation = (
         np.concatenate([getattr(claim, name) for claim in claims])
         for name in ("stated", "sd", "deviation")
     )
     away = np.concatenate([claim.stretch_sd(*stretch) * claim.away for claim in claims])
+    weight = _weight_of([claim.kind for claim in claims for _ in claim.stated])
+    order = np.argsort(stated, kind="stable")
+    below = np.cumsum(weight[order]) / weight.sum()
     knots = []
-    for rows in np.array_split(np.argsort(stated, kind="stable"), min(3, len(stated))):
+    for rows in np.split(order, np.searchsorted(below, (1 / 3, 2 / 3))):
 
         def too_wide(factor: float, rows: NDArray[np.int64] = rows) -> bool:
-            return bool(
-                (
-                    deviation[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
-                ).mean()
-                > 0.9
-            )
+            inside = deviation[rows] <= _Z90 * np.hypot(factor * sd[rows], away[rows])[..., None]
+            return bool(np.average(inside.mean(axis=(1, 2)), weights=weight[rows]) > 0.9)
 
         least, most = (0.3, 3.0)
         while too_wide(least) and least > 0.01:
@@ -403,7 +489,7 @@ def calibration_knots(claims: Sequence[_Claim], stretch: tuple[float, float]) ->
             factor = float(np.sqrt(least * most))
             least, most = (least, factor) if too_wide(factor) else (factor, most)
         knots.append((round(float(np.median(stated[rows])), 5), round(float(most), 3)))
-    return tuple(knots)
+    return (*knots, (1.0, max(1.0, knots[-1][1])))
 
 
 def calibrate_roots(measured: Sequence[Measured], tuning: TrackingParameters) -> TrackingParameters:
@@ -416,15 +502,16 @@ def calibrate_roots(measured: Sequence[Measured], tuning: TrackingParameters) ->
         tuning,
         root_calibration=(1.0,) * 6,
         bend_calibration=(1.0,) * 3,
-        unseen_height=0.0,
+        unseen_height=(0.0,),
         unseen_shift=0.0,
     )
     roots = []
     bends = []
     for each in measured:
+        if (true := each.pose) is None:
+            continue
         track = _track(each, plain)
         there = track.posed
-        true = each.pose
         deviation = SE3(track.root_rotation[there], track.root_mm[there]).inverse() @ SE3(
             true.root.rotation[there], true.root.translation[there]
         )

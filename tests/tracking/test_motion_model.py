@@ -2,6 +2,7 @@
 
 import tomllib
 from dataclasses import replace
+from statistics import mean
 
 import pytest
 
@@ -19,4 +20,7 @@ def test_an_animal_without_its_own_is_taken_for_a_mouse_and_a_fish_is_none():
     assert mouse != TrackingParameters.of("fish")
     # but for what is of the mouse's own joints
     assert mouse.motion.joint_calibration
-    assert snake == replace(mouse, motion=replace(mouse.motion, joint_calibration=()))
+    height = (mean(mouse.motion.unseen_height),)
+    assert snake == replace(
+        mouse, motion=replace(mouse.motion, joint_calibration=(), unseen_height=height)
+    )

@@ -12,6 +12,7 @@ from liex_lab.pipelines.training.motion_model import (
     Measured,
     calibrate_builds,
     calibrate_each_joint,
+    calibrate_expected,
     calibrate_joints,
     calibrate_roots,
     train_tracking,
@@ -25,6 +26,14 @@ from liex_lab.tracking.track import Track
 from tests.tracking.stories import MOUSE, SUBJECT, noisy, told, walk
 
 SECONDS = np.arange(80) / 30.0
+# of a mouse whose build is known
+KNOWN = with_motion(
+    TrackingParameters.of("mouse"),
+    joint_calibration=(),
+    unseen_height=(0.0,),
+    unseen_shift=0.0,
+    expected_share=1.0,
+)
 
 
 @pytest.fixture(scope="module")
@@ -75,10 +84,8 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
         sequences.append(
             replace(each, pose=pose, truth=truth, size_spread=0.0 if size == 1.0 else spread)
         )
-    tuning = calibrate_joints(sequences, TrackingParameters.of("mouse"))
-    alike = calibrate_joints(
-        [replace(each, size_spread=0.0) for each in sequences], TrackingParameters.of("mouse")
-    )
+    tuning = calibrate_joints(sequences, KNOWN)
+    alike = calibrate_joints([replace(each, size_spread=0.0) for each in sequences], KNOWN)
     assert tuning.motion.stretch[1] > 0
     assert alike.motion.stretch == (0.0, 0.0), "what tells nothing is not used"
     assert np.ptp(covered(sequences, tuning)) < 0.5 * np.ptp(covered(sequences, alike))
@@ -89,26 +96,28 @@ def test_who_is_taken_for_smaller_has_wider_intervals_and_who_is_not_has_none(me
     [("up", (-9.0, -4.0, 5.0, 7.0, 10.0)), ("along", (-9.0, -5.0, 4.0, 6.0, 9.0))],
 )
 def test_errors_that_last_throughout_a_recording_are_covered(measured, way, offs_mm):
-    tuning, builds, ways = TrackingParameters.of("mouse"), [], []
+    tuning, builds, ways = KNOWN, [], []
     for k, off_mm in enumerate(offs_mm):
         truth = measured[k % 2].truth
         along = truth[:, -1] - truth[:, 0]
         along /= np.linalg.norm(along, axis=1)[:, None]
         ways.append(np.full_like(along, [0.0, 0.0, 1.0]) if way == "up" else along)
-        builds.append(replace(measured[k % 2], truth=truth + off_mm * ways[-1][:, None]))
-    wider, inside = calibrate_builds(builds, tuning), []
+        subject = replace(SUBJECT, stretch_sd=0.0)
+        truth = truth + off_mm * ways[-1][:, None]
+        builds.append(replace(measured[k % 2], truth=truth, subject=subject))
+    wider = calibrate_builds(builds, tuning)
+    inside: dict[str, list] = {}
     for each, direction in zip(builds, ways, strict=True):
         track = tracked(each, wider)
         off = np.abs(np.einsum("njk,nk->nj", track.joints_mm - each.truth, direction))
         # half of the variance along the body stands beside x and half beside y
         beside = np.sqrt(2.0 * track.sd_xy_mm**2 - track.sd_mm**2)
-        inside.append(off <= 1.645 * (track.sd_z_mm if way == "up" else beside))
-        if way == "along":
-            np.testing.assert_array_equal(track.sd_z_mm, track.sd_mm)
-    assert 0.85 < np.mean(inside) < 0.95
-    assert way == "up" or wider.motion.unseen_height == tuning.motion.unseen_height
+        held = off <= 1.645 * (track.sd_z_mm if way == "up" else beside)
+        inside.setdefault(each.kind, []).append(held)
+    least = min(np.mean(held) for held in inside.values())
+    assert least == pytest.approx(0.9, abs=0.03), "of the family that needs most"
     blind = calibrate_builds([], tuning).motion
-    assert (blind.unseen_height, blind.unseen_shift) == (0.0, 0.0)
+    assert (blind.unseen_height, blind.unseen_shift) == ((0.0,), 0.0)
 
 
 def test_each_joint_has_intervals_of_its_own(measured):
@@ -126,24 +135,54 @@ def test_each_joint_has_intervals_of_its_own(measured):
     rump, *inner, neck, _ = tuning.motion.joint_calibration
     assert rump > 2.0
     assert neck < 0.4
-    assert inner == [1.0, 1.0], "what holds nine in ten stays as it is"
-    inside = []
+    np.testing.assert_allclose(inner, 1.0, atol=0.1)
+    held = []
     for each in wrong:
         track = tracked(each, tuning)
-        inside.append(np.abs(track.joints_mm - each.truth) <= 1.645 * track.sd_mm[..., None])
-    held = np.concatenate(inside).mean(axis=(0, 2))
-    assert held.min() > 0.83
-    assert held.max() < 0.97
-    unseen = with_motion(plain, unseen_height=0.02)
-    assert calibrate_each_joint(wrong, unseen).motion.joint_calibration == ()
+        off = np.abs(track.joints_mm - each.truth)[..., :2]
+        held.append((off <= 1.645 * track.sd_mm[..., None]).mean(axis=(0, 2)))
+    np.testing.assert_allclose(np.min(held, axis=0), 0.9, atol=0.02)  # in the family of least
     assert len(plain.motion.joint_calibration) == MOUSE.n_joints
     assert TrackingParameters.of("starling").motion.joint_calibration == (), "not the mouse's"
 
 
+def test_an_error_larger_than_those_calibrated_is_not_told_small(measured):
+    tuning = calibrate_joints(measured, TrackingParameters.of("mouse"))
+    stated, factor = np.array(tuning.motion.calibration).T
+    assert stated[-1] == 1.0
+    assert factor[-1] >= 1.0
+
+
+def test_a_small_family_of_bodies_counts_as_much_as_a_large_one(measured):
+    few, many = measured
+    once = calibrate_expected([few, many], TrackingParameters.of("mouse"))
+    often = calibrate_expected([few, many, many, many], TrackingParameters.of("mouse"))
+    assert once.motion.expected_share == often.motion.expected_share
+
+
+def test_the_predicted_error_is_right_in_the_median(measured):
+    plain = with_motion(KNOWN, unseen_height=(0.1,))
+    lower = [
+        replace(
+            each,
+            truth=each.truth - [0.0, 0.0, 4.0 + k],
+            subject=replace(each.subject, stretch_sd=0.0),
+        )
+        for k, each in enumerate(measured)
+    ]
+    tuning = calibrate_expected(lower, plain)
+    ratio = []
+    for each in lower:
+        track = tracked(each, tuning)
+        error_mm = np.linalg.norm(track.joints_mm - each.truth, axis=-1).mean(axis=1)
+        ratio.append(error_mm / track.predicted_error_mm)
+    assert np.median(np.concatenate(ratio)) == pytest.approx(1.0, abs=0.02)
+
+
 def test_a_height_nobody_sees_is_in_the_error_and_upright_in_the_roots_covariance(measured):
     each = measured[0]
-    plain = TrackingParameters.of("mouse")
-    higher = with_motion(plain, unseen_height=0.1)
+    plain = KNOWN
+    higher = with_motion(plain, unseen_height=(0.1,))
     before, after = (tracked(each, one) for one in (plain, higher))
     there = before.posed & after.posed
     R = before.root_rotation[there]
@@ -172,6 +211,7 @@ def test_the_table_is_the_same_on_one_thread_and_on_two(measured, tmp_path, monk
     each_kind = {each.kind: each for each in measured}
     monkeypatch.setattr(motion_model, "measure", lambda animal, kind, *_: each_kind[kind])
     monkeypatch.setattr(motion_model, "other_builds", lambda *_: measured[:1])
+    monkeypatch.setattr(motion_model, "foreign_bodies", lambda *_: measured[1:])
     one, two = trained_twice(tmp_path, seeds=(31,))
     assert one == two
 
@@ -183,7 +223,7 @@ def test_the_table_of_rendered_sequences_is_the_same_on_one_thread_and_on_two(tm
 
 
 def test_roots_and_bends_are_covered_as_well(measured):
-    tuning = calibrate_roots(measured, TrackingParameters.of("mouse"))
+    tuning = calibrate_roots(measured, KNOWN)
     turned, placed, bent = [], [], []
     free = MOUSE.axes[1:]
     for each in measured:
