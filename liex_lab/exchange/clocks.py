@@ -33,7 +33,11 @@ _WINDOW = 40  # pulses whose differences vote
 _FEWEST = 8  # matched pulses
 _STEP_S = 300.0  # longest part that is predicted by a line
 _SURE = 1e-3
+_CLOSE_S = 5e-4  # residuals below are never outliers
 _CANDIDATES = 3  # of each window
+_FINE = 0.125  # of the reach: for trains that are nearly regular
+_MOST_RATES = 40  # on either side, for the fine votes
+_ROUNDS = 6
 _FITTED = 20_000  # events at most
 _SD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
 _UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
@@ -145,14 +149,8 @@ def align(own_s: Any, other_s: Any, stated_s: Any = ()) -> Alignment:
     # how near an event is to its prediction: well below the interval of neighbours
     reach = float(np.clip(0.2 * min(_short(x), _short(y)), 0.001, 0.05))
     best, others = _ranked(x, y, reach, stated)
-    tight = float(np.clip(4.0 * best.sd_s, 0.0005, reach))
+    tight = float(np.clip(4.0 * best.sd_s, _CLOSE_S, reach))
     best = _matched(x, y, _fit(*_events(x, y, _matched(x, y, best.clock, tight))), tight)
-    _refuse_jump(x, y, best)
-    if len(best.pairs) < _FEWEST or best.share < 0.5:
-        raise SyncError(
-            f"the events fit nowhere: at best {len(best.pairs)} of {len(x)} and {len(y)} agree; "
-            "check the channel, and that both files are of the same session"
-        )
     for other in (_matched(x, y, one.clock, tight) for one in others):
         compared = min(other.n_overlapping) >= 0.5 * min(best.n_overlapping)
         if compared and _p_alike(best, other) > _SURE:
@@ -162,6 +160,13 @@ def align(own_s: Any, other_s: Any, stated_s: Any = ()) -> Alignment:
                 f"{other.share:.1%} if shifted by {shift:.3f} s; state that the first events are "
                 "the same (--first) or pairs of times (--pairs), or record random intervals"
             )
+    if len(best.pairs) >= _FEWEST:
+        _refuse_jump(x, y, best)
+    if len(best.pairs) < _FEWEST or best.share < 0.5:
+        raise SyncError(
+            f"the events fit nowhere: at best {len(best.pairs)} of {len(x)} and {len(y)} agree; "
+            "check the channel, and that both files are of the same session"
+        )
     return best
 
 
@@ -238,13 +243,19 @@ def _ranked(x: Array, y: Array, reach: float, stated: Array) -> tuple[Alignment,
         for seed in seeds:
             if all(abs(one.clock(seed.own) - seed.other) > 2.0 * reach for one in found):
                 one = _follow(x, y, seed, reach)
-                if one and (np.abs(one.clock(stated[:, 0]) - stated[:, 1]) <= near).all():
+                if (
+                    one
+                    and (np.abs(one.clock(stated[:, 0]) - stated[:, 1]) <= near).all()
+                    and (np.abs(one.clock.rates - 1.0) <= 2.0 * MOST_DRIFT).all()
+                ):
                     found.append(one)
 
     follow(_seeds(x, y, reach, stated, near))
     best: Alignment | None = None
-    for _ in range(_CANDIDATES if found else 0):
-        best = max(found, key=lambda one: one.score(reach))
+    for _ in range(_ROUNDS if found else 0):
+        before, best = best, max(found, key=lambda one: one.score(reach))
+        if best is before:
+            break
         follow(_shifted(x, y, best.clock, reach))
     if best is None:
         raise SyncError(
@@ -264,27 +275,35 @@ def _seeds(x: Array, y: Array, reach: float, stated: Array, near: float) -> Iter
         about = [(own, other, near) for own, other in stated]
     for one, (own, other, within) in zip(rows, about, strict=True):
         window = x[one] - own
-        step = 3.0 * reach / float(np.ptp(window))
-        n = int(MOST_DRIFT / step)
-        votes = [
-            (count, -abs(rate - 1.0), offset, rate)
-            for rate in 1.0 + step * np.arange(-n, n + 1)
-            for offset, count in _peaks(y[None] - rate * window[:, None], reach, other, within)
-        ]
-        kept: list[float] = []
-        for count, _, offset, rate in sorted(votes, reverse=True):
-            if len(kept) == _CANDIDATES or count < 0.7 * max(votes)[0]:
-                break
-            if all(abs(offset - before) > 4.0 * reach for before in kept):
-                kept.append(offset)
-                yield _Seed(one, own, offset, rate)
+        fine = max(_FINE * reach, MOST_DRIFT * float(np.ptp(window)) / (3.0 * _MOST_RATES))
+        for near_s in {reach, min(fine, reach)}:
+            step = 3.0 * near_s / float(np.ptp(window))
+            n = int(MOST_DRIFT / step)
+            votes = [
+                (count, -abs(rate - 1.0), offset, rate)
+                for rate in 1.0 + step * np.arange(-n, n + 1)
+                for offset, count in _peaks(y[None] - rate * window[:, None], near_s, other, within)
+            ]
+            kept: list[float] = []
+            for count, _, offset, rate in sorted(votes, reverse=True):
+                if len(kept) == _CANDIDATES or count < 0.7 * max(votes)[0]:
+                    break
+                if all(abs(offset - before) > 4.0 * reach for before in kept):
+                    kept.append(offset)
+                    yield _Seed(one, own, offset, rate)
 
 
 def _shifted(x: Array, y: Array, clock: ClockMap, reach: float) -> Iterator[_Seed]:
-    """Lines parallel to an alignment at which the trains fit in part: peaks of autocorrelation."""
+    """Lines parallel to an alignment at which the trains fit in part.
+
+    They are peaks of the autocorrelation, wide and narrow ones, and shifts by one event.
+    """
     chosen = x[:: len(x) // int(np.clip(2_000_000 // len(y), _WINDOW, 500)) + 1]
     differences = y[None] - clock(chosen)[:, None]
-    for shift, _ in _peaks(differences[np.abs(differences) > 4.0 * reach], reach):
+    apart = differences[np.abs(differences) > 4.0 * reach]
+    peaks = [shift for near in (reach, _FINE * reach) for shift, _ in _peaks(apart, near)]
+    one = float(np.median(np.diff(y)))
+    for shift in (*peaks, one, -one):
         shared = x[(clock(x) + shift >= y[0]) & (clock(x) + shift <= y[-1])]
         if len(shared) >= _FEWEST:
             rows = _window(x, float(np.median(shared)))
@@ -393,7 +412,7 @@ def _events(x: Array, y: Array, of: Alignment) -> tuple[Array, Array]:
     return x[of.pairs[:, 0]], y[of.pairs[:, 1]]
 
 
-def _fit(x: Array, y: Array, most: int = 64) -> ClockMap:
+def _fit(x: Array, y: Array, most: int = 256) -> ClockMap:
     """The map through matched events by trimmed least squares, with up to `most` + 1 knots.
 
     Every piece has twelve events and lasts a minute. Outliers are those of the finest map.
@@ -403,9 +422,9 @@ def _fit(x: Array, y: Array, most: int = 64) -> ClockMap:
     finest = min(most, max(1, len(x) // 12), max(1, int(np.ptp(x) / 60.0)))
     for _ in range(2 if len(x) > 3 else 0):
         residual = np.abs(y - _solved(x, y, finest)[0](x))
-        kept = residual <= max(4.0 * _SD * float(np.median(residual)), 2e-5)
+        kept = residual <= max(4.0 * _SD * float(np.median(residual)), _CLOSE_S)
         x, y = x[kept], y[kept]
-    levels = [n for n in (1, 4, 16, 64) if n <= finest]
+    levels = [n for n in (1, 4, 16, 64, 256) if n <= finest]
     fits = [_solved(x, y, n) for n in levels]
     bic = [
         len(x) * np.log(v + 1e-12) + n * np.log(len(x))
@@ -434,18 +453,16 @@ def _refuse_jump(x: Array, y: Array, best: Alignment) -> None:
     Raises:
         SyncError: a clock jumps.
     """
-    predicted = best.clock(x)
-    rows = np.flatnonzero((predicted >= y[0]) & (predicted <= y[-1]))
-    edges = np.concatenate([[rows[0] - 1], best.pairs[:, 0], [rows[-1] + 1]]) if len(rows) else [0]
-    k = int(np.argmax(np.diff(edges))) if len(rows) else 0
-    if not len(rows) or not len(best.pairs):
-        return
+    rows = np.flatnonzero(best.inside[0])
+    edges = np.concatenate([[rows[0] - 1], best.pairs[:, 0], [rows[-1] + 1]])
+    k = int(np.argmax(np.diff(edges)))
     first, last = int(edges[k]) + 1, int(edges[k + 1]) - 1
-    alone = max(last - first + 1, 0)
-    theirs = int(((y >= predicted[first]) & (y <= predicted[last])).sum()) if alone else 0
-    elsewhere = sum(best.n_overlapping) - alone - theirs
-    if min(alone, theirs) >= _FEWEST and 2 * len(best.pairs) >= 0.7 * max(elsewhere, 2 * _FEWEST):
+    n = last - first + 1
+    start, stop = best.clock(x[[first, max(first, last)]])
+    theirs = int(((y >= start) & (y <= stop)).sum())
+    elsewhere = sum(best.n_overlapping) - n - theirs
+    if min(n, theirs) >= _FEWEST and 2 * len(best.pairs) >= 0.7 * elsewhere:
         raise SyncError(
-            f"a clock jumps: from {x[first]:.3f} to {x[last]:.3f} s of the session {alone} events "
-            f"fit none of the {theirs} there, although the others fit; align the parts separately"
+            f"a clock jumps: from {x[first]:.3f} to {x[last]:.3f} s of the session {n} events fit "
+            f"none of the {theirs} there, although others fit; split the recording there"
         )

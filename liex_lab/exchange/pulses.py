@@ -148,11 +148,18 @@ def _neo(reader: str) -> Callable[[Path, str], Any]:
 
         raw = getattr(neo.rawio, reader)(path if path.is_dir() else path.parent)
         raw.parse_header()
-        names = [str(name) for name in raw.header["event_channels"]["name"]]
-        k = names.index(_chosen(channel, names, "channel"))
-        stamps, _, labels = raw.get_event_timestamps(0, 0, k)
-        up = [not str(label).endswith(("OFF", "-", "0")) for label in labels]
-        return np.sort(raw.rescale_event_timestamp(stamps, "float64", k)[up])
+        n = sum(raw.segment_count(k) for k in range(raw.block_count()))
+        if n != 1:
+            raise LiexError(f"it holds {n} recordings, and one is expected; name the folder of one")
+        lines: dict[str, Any] = {}
+        for k, name in enumerate(raw.header["event_channels"]["name"]):
+            stamps, _, labels = raw.get_event_timestamps(0, 0, k)
+            times = raw.rescale_event_timestamp(stamps, "float64", k)
+            for label in np.unique(labels):
+                line = str(label) if str(label).startswith(name) else f"{name} {label}"
+                lines[line] = times[labels == label]
+        rising = [line for line in lines if not line.endswith(" OFF")]
+        return np.sort(lines[_chosen(channel, rising, "line")])
 
     return read
 
@@ -164,7 +171,8 @@ def _harp(path: Path, channel: str) -> Any:
     values = table.iloc[:, 0].to_numpy(np.int64)
     bits = [str(k) for k in range(64) if ((values >> k) & 1).any()]
     bit = int(_chosen(channel, bits, "bit"))
-    return table.index.to_numpy(float)[rises((values >> bit) & 1)]
+    # a message is sent at each change: a first one that is high is a rise
+    return table.index.to_numpy(float)[rises(np.append(0, (values >> bit) & 1))[1:]]
 
 
 # of each kind of file: its reader, and the extra with its package

@@ -1,5 +1,7 @@
 """Two trains of events give the map between their clocks, or are refused."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,7 +14,7 @@ TRAIN = np.cumsum(RNG.uniform(0.5, 1.5, 300))
 REGULAR = np.arange(300) * 0.5
 
 
-def other_clock(times: np.ndarray) -> np.ndarray:
+def other_clock(times: Any) -> Any:
     return 7000.0 + 1.0001 * np.asarray(times)
 
 
