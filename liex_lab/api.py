@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.points import import_points
     from liex_lab.pipelines.session import run_demo, run_session
     from liex_lab.pipelines.study.status import SessionStatus
+    from liex_lab.pipelines.sync import sync_session
     from liex_lab.pipelines.verify import verify_session
 
 _JOBS = {  # function: the module of `pipelines` that defines it
@@ -41,6 +42,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "follow_live": "live",
     "import_points": "points",
     "run_demo": "session",
+    "sync_session": "sync",
     "verify_session": "verify",
     "write_long": "evaluation.scale",
     "run_scale": "evaluation.scale",
@@ -60,6 +62,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "evaluate_live": "evaluation.speed",
     "evaluate_report": "evaluation.scale",
     "evaluate_statistics": "evaluation.statistics",
+    "evaluate_sync": "evaluation.sync",
     "evaluate_motion": "evaluation.motion",
     "motion_in_short": "evaluation.motion",
     "evaluate_nyu": "evaluation.nyu",
@@ -84,6 +87,7 @@ __all__ = [  # noqa: RUF022 - in the order of the manual
     "run_arenas",
     "correct_session",
     "describe_session",
+    "sync_session",
     "follow_live",
     "import_points",
     "run_demo",

@@ -5,10 +5,11 @@ of flips, moved joints and edited bouts, and the tables derived from the active 
 replaces the folder as a whole, and its predecessor is removed only once the new one is on disk.
 """
 
+import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,10 @@ def correct_session(
                 progress(0, None, "measuring what was corrected")
                 log = _apply(raw, log, part)
             if log.described:
-                log = _describe(raw, log, part)
+                _describe(raw, log, part)
+            if log.clock:
+                log = _synchronise(raw, log, part)
+            log = replace(log, files=file_facts(part))
             (part / corrections.LOG).write_text(log.to_json(), encoding="utf-8")
             durable.move_into_place(part, folder, aside)
         finally:
@@ -168,11 +172,11 @@ def _apply(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
     rrd.ReplayWriter(folder / corrections.REPLAY, origin, layout, corrected=True).finish(
         rows, behaviour.kinematics, behaviour.bouts, list(behaviour.actions), ()
     )
-    return replace(log, files=file_facts(folder), facts=facts)
+    return replace(log, facts=facts)
 
 
-def _describe(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
-    """Write the table `sessions` with the corrected description; returns the log with this file."""
+def _describe(raw: Session, log: corrections.Log, folder: Path) -> None:
+    """Write the table `sessions` with the corrected description."""
     path = folder / "sessions.parquet"
     table = pd.read_parquet(path) if path.is_file() else raw.table("sessions")
     described = {key: value for key, value in log.described.items() if key in table}
@@ -180,8 +184,36 @@ def _describe(raw: Session, log: corrections.Log, folder: Path) -> corrections.L
     schema.write_table(
         path, schema.SESSIONS, schema.from_pandas(table.assign(**described)), metadata
     )
-    kept = {name: facts for name, facts in log.files.items() if name != path.name}
-    return replace(log, files={**kept, path.name: file_facts(folder)[path.name]})
+
+
+def _synchronise(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
+    """Add the columns of the other clock to frames, bouts and columns.json; returns the log."""
+    clock = log.clock
+    assert clock is not None
+    first_ns = int(raw.table("frames", ["time_ns"])["time_ns"].iloc[0])
+
+    def on_frames(block: schema.Block) -> dict[str, Any]:
+        times, sd = clock.times_s(block["time_ns"])
+        return {"sync_s": times, "sync_sd_ms": 1e3 * sd}
+
+    def on_bouts(block: schema.Block) -> dict[str, Any]:
+        since_ns = (np.rint(1e9 * block[name]).astype(np.int64) for name in ("start_s", "stop_s"))
+        starts, stops = (clock.times_s(first_ns + one)[0] for one in since_ns)
+        return {"sync_start_s": starts, "sync_stop_s": stops}
+
+    def latest(name: str) -> Path:
+        """A file with the corrections made so far."""
+        return folder / name if (folder / name).is_file() else raw.path / name
+
+    for name, compute in (("frames.parquet", on_frames), ("bouts.parquet", on_bouts)):
+        part = folder / f"{name}.part"
+        schema.append_columns(latest(name), part, schema.SYNCED[Path(name).stem], compute)
+        part.replace(folder / name)
+    columns = json.loads(latest("columns.json").read_text(encoding="utf-8"))
+    columns += [asdict(column) for added in schema.SYNCED.values() for column in added]
+    text = json.dumps(columns, indent=1, ensure_ascii=False)
+    (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
+    return replace(log, facts={**log.facts, "sync": clock.facts()})
 
 
 def _summary(log: corrections.Log) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Figures, videos and whole images: `liex figures`, `liex export --to video`, `liex show`."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -177,7 +177,7 @@ def whole_images(
     origin = replace(
         evidence.provenance_of(opened, evidence.skeleton_of(opened)), replay_depth=cutouts.ALL
     )
-    with _recording_of(opened, recording, progress) as images:
+    with recording_of(opened, recording, progress) as images:
         replay = rrd.ReplayWriter(out, origin)
         try:
             # frames in memory at a time
@@ -194,8 +194,23 @@ def whole_images(
     return out
 
 
-def _recording_of(session: Session, stated: str | None, progress: Progress) -> Recording:
-    """The recording of a session, opened with the session's plan after its hash is checked."""
+def recording_of(
+    session: Session,
+    stated: str | None,
+    progress: Progress,
+    build: Callable[[str, Plan, Progress], Recording] = build_recording,
+) -> Recording:
+    """The recording of a session, opened with the session's plan; its hash is checked.
+
+    Args:
+        session: the session.
+        stated: path of the recording, if it has moved.
+        progress: called while it is hashed.
+        build: opens a path with a plan.
+
+    Raises:
+        SessionError: the recording is not linked, missing, or another one.
+    """
     where = stated or evidence.linked_recording(session)
     if where is None:
         raise SessionError(
@@ -207,7 +222,7 @@ def _recording_of(session: Session, stated: str | None, progress: Progress) -> R
             f"full depth images are missing: the recording of {session.path.name} is not at "
             f"{where} any more; name it with --recording"
         )
-    recording = build_recording(where, Plan.from_toml(session.plan, "plan.toml"), progress)
+    recording = build(where, Plan.from_toml(session.plan, "plan.toml"), progress)
     try:
         if recording.digest(progress) != session.metadata["input"]["sha256"]:
             raise SessionError(

@@ -75,6 +75,7 @@ AFTER = {
     "docs/howto/points.md": "README.md",
     "docs/howto/skin-points.md": "README.md",
     "docs/howto/spreadsheet.md": "README.md",
+    "docs/howto/sync.md": "README.md",
     "docs/reference/session-folder.md": "README.md",
     "docs/tutorials/study.md": "docs/tutorials/mouse.md",
 }
@@ -84,6 +85,9 @@ SAME = {"docs/start.md": "README.md"}
 GROUPS = r"""
 awk '/^group/ {sub("\"\"", n++ % 2 ? "\"drug\"" : "\"vehicle\"")} 1' study/study.toml > edited
 mv edited study/study.toml
+"""
+PULSES = """
+seq 1 0.05 2.6 | awk '{t = $1 * $1 / 2; print t > "camera.csv"; print t + 9 > "ephys.csv"}'
 """
 CHANGED = {
     "docs/howto/corrections.md": {
@@ -98,6 +102,7 @@ CHANGED = {
         "A.liex B.liex": "study/derivatives/liex-lab/sub-m0[12]*/*/behav",
         "--action rear_supported": "--action walk",
     },
+    "docs/howto/sync.md": {"liex sync": f"{PULSES}liex sync"},
     "docs/tutorials/study.md": {
         "frames=90": "frames=40",
         "liex cohort study/study.toml --dry-run": f"{GROUPS}liex cohort study/study.toml --dry-run",

@@ -43,6 +43,7 @@ OF_SESSION: dict[str, tuple[str, Callable[[SessionAnimal], Figure | None]]] = {
     "distance": ("distance summed up over the session", times.cumulative_distance),
     "speed": ("share of the time at each speed", times.speed_distribution),
     "error": ("share of the time at each predicted error", times.error_distribution),
+    "sync": ("residuals of the events on both clocks", times.clock_residuals),
 }
 OF_STUDY: dict[str, tuple[str, Callable[[Sequence[SessionAnimal]], Figure | None]]] = {
     "ethograms": ("a row for each session", groups.ethograms),

@@ -211,6 +211,28 @@ def error_distribution(animal: SessionAnimal) -> Figure | None:
     )
 
 
+def clock_residuals(animal: SessionAnimal) -> Figure | None:
+    """Residuals of the events that both clocks recorded, over time; None without another clock."""
+    found = animal.session.metadata.get("sync")
+    if not found:
+        return None
+    time_s, residual_ms = np.reshape(np.array(found["residuals"], float), (-1, 2)).T
+    width = TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM
+    figure, axes = one_panel(
+        (TWO_COLUMNS_MM, 37.0),
+        (LEFT_MM, 8.0, width, 22.0),
+        f"Clock of {found['name']}, n = {counted(found['n_matched'], 'event')}, residual "
+        f"{found['rms_ms']:.2f} ms (RMS)",
+    )
+    span = min(0.0, *time_s), max(animal.duration_s, *time_s)
+    _, size = time_unit(span[1] - span[0])
+    axes.axhline(0.0, color=MUTED, linewidth=0.5)
+    axes.plot(time_s / size, residual_ms, ".", color=BLUE, markersize=2.5, gid="residuals")
+    axes.set_ylabel("residual, ms")
+    _clock(axes, span)
+    return figure
+
+
 def distribution(
     title: str, animal: SessionAnimal, values: Array, hold_s: Array, unit: str, colour: str
 ) -> Figure | None:

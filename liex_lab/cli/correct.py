@@ -218,6 +218,72 @@ def describe(
     echo(f"report:    {session / 'report.html'}")
 
 
+def sync(
+    session: SessionPath,
+    other: Annotated[
+        Path | None,
+        typer.Option(
+            "--with",
+            metavar="FILE",
+            help="Pulses of the other instrument: .csv, .npy, .npz, .nwb, a folder of Open Ephys, "
+            "SpikeGLX's or Harp's .bin.",
+        ),
+    ] = None,
+    channel: Annotated[
+        str, typer.Option("--channel", help="Column, array, series, line or bit of the pulses.")
+    ] = "",
+    pulses: Annotated[
+        Path | None,
+        typer.Option(
+            "--pulses",
+            metavar="FILE",
+            help="The same pulses in seconds since the session's first frame; default: one for "
+            "each frame.",
+        ),
+    ] = None,
+    patch: Annotated[
+        str | None,
+        typer.Option(
+            "--patch",
+            metavar="LEFT,TOP,RIGHT,BOTTOM",
+            help="Pixels of the recorded depth image whose mean falls at each pulse, as by an LED.",
+        ),
+    ] = None,
+    pairs: Annotated[
+        Path | None,
+        typer.Option(
+            "--pairs", metavar="CSV", help="Moments on both clocks: columns time_s and other_s."
+        ),
+    ] = None,
+    first: Annotated[
+        bool, typer.Option("--first", help="The first pulses of both sides are the same.")
+    ] = False,
+    by: Author = "",
+) -> None:
+    """Put a session's times on the clock of another instrument, by pulses that both recorded."""
+    try:
+        left, top, right, bottom = (int(cell) for cell in (patch or "0,0,0,0").split(","))
+    except ValueError:
+        raise typer.BadParameter("--patch takes LEFT,TOP,RIGHT,BOTTOM, four pixels") from None
+    with progress_bar() as progress:
+        fit = api.sync_session(
+            session,
+            other,
+            channel=channel,
+            pulses=pulses,
+            patch=(left, top, right, bottom) if patch else None,
+            pairs=pairs,
+            first=first,
+            author=by,
+            progress=progress,
+        )
+    ours, others = fit.n_unmatched
+    echo(f"synced:    {fit}")
+    echo(f"alone:     {ours} events of the session and {others} of {fit.name}")
+    echo(f"tables:    {session / 'corrected'} (frames sync_s; bouts sync_start_s and sync_stop_s)")
+    echo(f"report:    {session / 'report.html'}")
+
+
 def _opened(session: Path) -> liex_lab.Session:
     return liex_lab.Session.open(session)
 

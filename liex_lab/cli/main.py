@@ -16,7 +16,7 @@ import typer
 
 import liex_lab
 from liex_lab import api
-from liex_lab.cli.correct import correct, describe
+from liex_lab.cli.correct import correct, describe, sync
 from liex_lab.cli.models import evaluate, train
 from liex_lab.cli.options import (
     MODELS,
@@ -76,6 +76,7 @@ imports = command_group("Make sessions from the results of other programs.")
 app.add_typer(imports, name="import", rich_help_panel=RECORDINGS)
 for command, section in (
     (describe, SESSIONS),
+    (sync, SESSIONS),
     (report, SESSIONS),
     (figures, SESSIONS),
     (verify, SESSIONS),

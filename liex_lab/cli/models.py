@@ -522,6 +522,18 @@ def evaluate_statistics(
     return api.evaluate_statistics(n_studies, effect, progress=progress)
 
 
+@benchmark("sync")
+def evaluate_sync(
+    n_pairs: Annotated[
+        int, typer.Option("--pairs", min=8, help="Number of simulated pairs of clocks.")
+    ] = 1000,
+    *,
+    progress: Progress,
+) -> Result:
+    """Measure errors of aligned clocks, and how many are refused, on simulated pulse trains."""
+    return api.evaluate_sync(n_pairs, progress=progress)
+
+
 @benchmark("report")
 def evaluate_report(
     session: SessionPath,

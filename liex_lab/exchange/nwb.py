@@ -28,6 +28,7 @@ from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit
 from liex_lab.sessions.session import PULSE, PoseArrays
 from liex_lab.tables.rows import stop_times
+from liex_lab.tables.schema import SYNCED
 
 _HUMAN = "human"
 _MADE_BY = ("action_model", "rules")  # sections of session.json
@@ -165,6 +166,17 @@ def build(session: Session) -> pynwb.NWBFile:
     poses = session.pose_arrays()
     estimate = _add_poses(made, module, session, poses, version)
     _add_rotations(module, session, poses)
+    if clock := session.log.clock:
+        module.add(
+            pynwb.TimeSeries(
+                name="sync_s",
+                data=session.frames["sync_s"].to_numpy(),
+                unit="seconds",
+                timestamps=poses.time_s,
+                description=f"{SYNCED['frames'][0].meaning}: {clock.name}",
+                comments=str(clock),
+            )
+        )
     catalogue = _catalogue(session)
     if len(catalogue):
         module.add(catalogue)

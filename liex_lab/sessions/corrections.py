@@ -1,4 +1,4 @@
-"""Append-only log of human corrections to a session: flips, joints, bouts and descriptions.
+"""Append-only log of additions to a session: flips, joints, bouts, descriptions, a clock.
 
 The files of a session are never rewritten. Its folder `corrected` contains `corrections.json`, a
 log to which entries are only appended (an entry may undo another), and the tables that result from
@@ -22,12 +22,13 @@ from pydantic.dataclasses import dataclass
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError, one_line, refuse
 from liex_lab.runtime.durable import safe_name
+from liex_lab.sessions.clock import ClockFit
 from liex_lab.sessions.verdict import ALSO, SUBJECT
 
 FOLDER = "corrected"
 LOG = "corrections.json"
 REPLAY = "corrected.rrd"
-SCHEMA_VERSION = 3  # 2: species and age are described; 3: redo
+SCHEMA_VERSION = 4  # 2: species and age are described; 3: redo; 4: clock
 FACTS = {
     "frames",
     "actions",
@@ -35,6 +36,7 @@ FACTS = {
     "unresolved_actions",
     "refused_bouts",
     "corrections",
+    "sync",
 }  # sections that may change
 START = "session_start_time"
 DESCRIBED = (*SUBJECT, *ALSO, START)
@@ -156,7 +158,7 @@ class Description:
         return f"{self.key} is {self.value or 'not known'}"
 
 
-Correction = FlipSpan | JointMove | BoutEdit | Description
+Correction = FlipSpan | JointMove | BoutEdit | Description | ClockFit
 _CORRECTION: TypeAdapter[Correction] = TypeAdapter(
     Annotated[Correction, Field(discriminator="kind")]
 )
@@ -269,8 +271,14 @@ class Log:
 
     @property
     def touched(self) -> tuple[LogEntry, ...]:
-        """The active corrections of measurements: all except descriptions."""
-        return tuple(one for one in self.standing if not isinstance(one.what, Description))
+        """The active corrections of measurements: all except descriptions and clocks."""
+        other = (Description, ClockFit)
+        return tuple(one for one in self.standing if not isinstance(one.what, other))
+
+    @property
+    def clock(self) -> ClockFit | None:
+        """The other clock that the session's times are put on: the last one; None if absent."""
+        return next(iter(reversed(self.corrections(ClockFit))), None)
 
     def added(
         self, what: Sequence[Correction], undo: Sequence[int] = (), author: str = ""
@@ -304,8 +312,10 @@ class Log:
         """The content of corrections.json, including its own hash."""
         undos = {entry.number for entry in self.entries if entry.what is None}
         redone = any(entry.undoes in undos for entry in self.entries)
+        clocked = any(isinstance(entry.what, ClockFit) for entry in self.entries)
         document = {
-            "schema_version": SCHEMA_VERSION if redone else 2,  # readable by earlier versions
+            # readable by earlier versions
+            "schema_version": SCHEMA_VERSION if clocked else 3 if redone else 2,
             "made_of": self.made_of,
             "entries": [entry.to_dict() for entry in self.entries],
             "files": self.files,

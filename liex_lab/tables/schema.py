@@ -8,7 +8,7 @@ kinds of rears. Writers, readers, columns.json, the report and the manual read t
 
 import csv
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import chain, groupby
@@ -139,6 +139,10 @@ TABLES: dict[str, tuple[Column, ...]] = {
     for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "sessions")
 }
 FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS = TABLES.values()
+SYNCED = {  # on the clock of another instrument, see `sessions.clock`; by table
+    name: tuple(_column(line, {}) for line in _listed()[name] if line["when"] == "synced")
+    for name in ("frames", "bouts")
+}
 POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
@@ -150,7 +154,7 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    every = chain(*TABLES.values(), POINTS, branching, swimming, walking)
+    every = chain(*TABLES.values(), *SYNCED.values(), POINTS, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 
 
@@ -225,6 +229,31 @@ def write_table(
             writer.write_table(batch, row_group_size=ROWS_PER_GROUP)
             del block, columns, batch  # to free memory for the next block
     return n_rows
+
+
+def append_columns(
+    path: Path, to: Path, columns: Sequence[Column], compute: Callable[[Block], Block]
+) -> None:
+    """Write a table with further columns, with one row group in memory at a time.
+
+    Args:
+        path: the table's file.
+        to: the file to write.
+        columns: descriptions of the new columns.
+        compute: called with the columns of some rows; returns the new ones.
+    """
+    with pq.ParquetFile(path) as file:
+        described = json.loads(file.schema_arrow.metadata[b"liex_lab"])
+        described["columns"] |= {column.name: asdict(column) for column in columns}
+        fields = [*file.schema_arrow, *arrow_schema(columns, {})]
+        arrow = pa.schema(fields, {"liex_lab": json.dumps(described, sort_keys=True)})
+        texts = [field.name for field in fields if field.type == pa.string()]
+        with pq.ParquetWriter(to, arrow, compression="zstd", use_dictionary=texts) as writer:
+            for k in range(file.num_row_groups):
+                group = file.read_row_group(k)
+                more = compute({name: group[name].to_numpy() for name in group.column_names})
+                added = [pa.array(more[column.name]) for column in columns]
+                writer.write_table(pa.Table.from_arrays([*group.columns, *added], schema=arrow))
 
 
 def check_described(names: Iterable[str], schema: Sequence[Column], table: str = "") -> None:

@@ -1,0 +1,115 @@
+"""A session's times are put on another instrument's clock, as a correction that can be undone."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pynwb
+import pytest
+from liex_lab.pipelines.correct import correct_session
+from liex_lab.pipelines.sync import sync_session
+from liex_lab.pipelines.verify import verify_session
+from typer.testing import CliRunner
+
+from liex_lab import cli
+from liex_lab.errors import LiexError, SessionError
+from liex_lab.exchange import export
+from liex_lab.plan import Plan
+from liex_lab.sessions import Session, correcting
+from tests.sessions.walking_mouse import WalkingMouse, write
+
+RNG = np.random.default_rng(3)
+# a camera that lost frames: true stamps count, not numbers of frames
+MOUSE = WalkingMouse(
+    np.delete(np.arange(240) / 30.0, [5, 6, 100, 101, 102, 103]), rear_s=(2.0, 3.5)
+)
+PULSES = np.cumsum(RNG.uniform(0.2, 0.4, 24))
+
+
+def other_clock(times: Any) -> Any:
+    return 512.0 + 1.0002 * np.asarray(times)
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    folder = tmp_path_factory.mktemp("measured") / "circle.liex"
+    return write(
+        folder,
+        MOUSE,
+        plan_toml=Plan.load("mouse").to_toml(),
+        session_start_time="2026-08-21T10:00:00+02:00",
+    )
+
+
+@pytest.fixture
+def session(measured: Session, tmp_path: Path) -> Session:
+    folder = Session.open(shutil.copytree(measured.path, tmp_path / "circle.liex"))
+    pd.DataFrame({"time_s": PULSES}).to_csv(tmp_path / "ours.csv", index=False)
+    np.save(tmp_path / "ephys.npy", other_clock(np.delete(PULSES, 4)))
+    return folder
+
+
+def test_a_session_is_synced_corrected_and_undone(session: Session, tmp_path: Path) -> None:
+    arguments = ["--with", str(tmp_path / "ephys.npy"), "--pulses", str(tmp_path / "ours.csv")]
+    for _ in range(2):  # again changes nothing
+        done = CliRunner().invoke(cli.app, ["sync", str(session.path), *arguments])
+        assert done.exit_code == 0, done.output
+        assert "23 events, residual 0.00 ms" in done.output
+        assert "1 events of the session and 0 of ephys.npy" in done.output
+    synced = Session.open(session.path)
+    assert len(synced.log.entries) == 1
+    frames, bouts = synced.frames, synced.bouts
+    np.testing.assert_allclose(frames["sync_s"], other_clock(frames["time_s"]), atol=1e-5)
+    np.testing.assert_allclose(bouts["sync_stop_s"], other_clock(bouts["stop_s"]), atol=1e-5)
+    assert frames["sync_sd_ms"].between(0.0, 1.0).all()
+    assert synced.metadata["sync"]["name"] == "ephys.npy"
+    assert {"sync_s", "sync_start_s"} <= set(synced.columns["name"])
+    assert b"sync_s" in pq.read_schema(synced.file("frames.parquet")).metadata[b"liex_lab"]
+    assert (session.path / "figures" / "sync.svg").is_file()
+    assert "Clock of ephys.npy" in (session.path / "report.html").read_text(encoding="utf-8")
+    assert {one.state for one in verify_session(session.path)} <= {"ok", "note"}
+    with pynwb.NWBHDF5IO(export(synced, "nwb", tmp_path), "r") as file:
+        series = file.read().processing["behavior"]["sync_s"]
+        np.testing.assert_array_equal(series.data[:], frames["sync_s"])
+        np.testing.assert_array_equal(series.timestamps[:], frames["time_s"])
+
+    moved = correcting.joint_move(synced, 60, "nose", synced.pose_arrays().xyz_mm[60, -1] + 2.0)
+    correct_session(session.path, [moved], report=False)
+    corrected = Session.open(session.path)
+    assert "corrected" in set(corrected.frames["flag"])
+    pd.testing.assert_series_equal(corrected.frames["sync_s"], frames["sync_s"])
+    assert (corrected.bouts["sync_start_s"] < corrected.bouts["sync_stop_s"]).all()
+    correct_session(session.path, undo=[1, 2], report=False)
+    undone = Session.open(session.path)
+    assert "sync_s" not in undone.frames
+    assert "sync" not in undone.metadata
+
+
+def test_frames_are_pulses_when_the_first_one_is_stated(session: Session, tmp_path: Path) -> None:
+    np.save(tmp_path / "exposures.npy", other_clock(np.arange(240) / 30.0))
+    fit = sync_session(session.path, tmp_path / "exposures.npy", first=True)
+    assert fit.n_matched == 234
+    assert fit.n_unmatched == (0, 6)
+    frames = Session.open(session.path).frames
+    np.testing.assert_allclose(frames["sync_s"], other_clock(frames["time_s"]), atol=1e-5)
+
+
+def test_stated_pairs_suffice(session: Session, tmp_path: Path) -> None:
+    (tmp_path / "pairs.csv").write_text("time_s;other_s\n1,0;11,0\n7,0;17,0\n")
+    assert sync_session(session.path, pairs=tmp_path / "pairs.csv").sd_s is None
+    frames = Session.open(session.path).frames
+    np.testing.assert_allclose(frames["sync_s"], frames["time_s"] + 10.0)
+    assert frames["sync_sd_ms"].isna().all()
+    with pytest.raises(SessionError, match="nothing to align"):
+        sync_session(session.path)
+
+
+def test_a_session_is_whole_if_it_is_not_synced(session: Session, tmp_path: Path) -> None:
+    before = sorted(path.name for path in session.path.iterdir())
+    np.save(tmp_path / "other.npy", np.cumsum(RNG.uniform(0.2, 0.4, 24)))
+    with pytest.raises(LiexError, match=r"fit nowhere|more than one way"):
+        sync_session(session.path, tmp_path / "other.npy", pulses=tmp_path / "ours.csv")
+    assert sorted(path.name for path in session.path.iterdir()) == before
