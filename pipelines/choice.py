@@ -106,8 +106,8 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
         )
     if fit.n_animals > 1:
         problems.append(
-            f"{fit.n_animals} animals are in view at once and a run follows one of them; record "
-            "them one at a time"
+            f"{fit.n_animals} animals are in view at once and a run follows one of them, whose "
+            "poses are then not trusted; record them one at a time"
         )
     given_fits = plan is not None and found is first
     return Proposal(found.name, summary, fit.n_animals, tuple(problems), given_fits)

@@ -398,9 +398,9 @@ def _region(
                 "whole images are kept, for the measurement uses all of them, not only the arena; "
                 "name the region to be kept with --region"
             ]
-        if learned.scene.support_plane.n_together > 1:  # type: ignore[attr-defined]
+        if learned.scene.n_animals > 1:
             return None, [
-                "whole images are kept, for more than one object moves in them; name what is to "
+                "whole images are kept, for more than one animal moves in them; name what is to "
                 "be kept with --region"
             ]
         # margins that are tried around the found region, of the image's width

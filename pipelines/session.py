@@ -540,7 +540,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     place = tracker.scene.floor.unusual(None if water is None else water.lift_mm)
     shape = "" if tracker.shape is None else tracker.shape.caution(tracker.spine_mm)
     verdict = Verdict.of(
-        tracked.track,
+        tracked,
         whole,
         misfits=fitted.misfits,
         doubts=(
@@ -551,7 +551,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *frozen,
             *recording.files.rewritten(),
         ),
-        n_animals=subject.n_animals,
+        n_measured=subject.n_measured,
         cautions=(
             *fitted.notes,
             *copied,
@@ -563,7 +563,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
         ),
         accepted=fitted.plan.estimation.accept_misfit,
     )
-    writer.take(tracked, whole, subject)
+    writer.take(tracked, whole, replace(subject, n_animals=tracked.n_animals))
     return verdict
 
 

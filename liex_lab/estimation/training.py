@@ -330,14 +330,14 @@ def _choices(
         size = size if model.method.session_size else 1.0
         images = data.images[rows]
         camera = crop_columns(images.crop_cameras)
-        crops = HeightMaps(
-            images.heights,
-            np.stack([camera.u0, camera.v0], axis=-1).astype(np.int32),
-            camera.step.astype(np.int32),
-            np.full(len(rows), 1),
-            images.moments,
-            camera.distance,
-            np.ones(len(rows), np.int64),
+        crops = replace(
+            HeightMaps.blank(len(rows), camera.distance),
+            heights=images.heights,
+            origin=np.stack([camera.u0, camera.v0], axis=-1).astype(np.int32),
+            step=camera.step.astype(np.int32),
+            n_px=np.full(len(rows), 1),
+            moments=images.moments,
+            n_blobs=np.ones(len(rows), np.int64),
         )
         detection = estimator.candidates(crops, images.crop_cameras, size)
         yield rows, detection, size, estimator.pick(detection, size)

@@ -31,7 +31,13 @@ from liex_lab.scene.background import (
     SceneChange,
 )
 from liex_lab.scene.floor import Array, Depths, Floor, Mask
-from liex_lab.scene.height_maps import HeightMaps, Segmenter, pack_crop_cameras, size_misfit
+from liex_lab.scene.height_maps import (
+    N_OBJECTS,
+    HeightMaps,
+    Segmenter,
+    pack_crop_cameras,
+    size_misfit,
+)
 from liex_lab.scene.scene import Fixture, Scene, find_fixtures, region_corners, roughness
 from liex_lab.scene.support_plane import SupportPlane
 from liex_lab.scene.worn import Cable, Worn
@@ -60,6 +66,8 @@ class BackgroundSubtraction(Segmenter):
         changed: a lasting change of the scene; None without one.
         sensor: quality of its readings; None without a sample.
         transient_objects: objects that stand on the floor for a part of the recording.
+        n_animals: how many animals are in view at once in the sampled frames.
+        n_animals_share: share of the frames with an animal in which as many stand free.
     """
 
     camera: Camera
@@ -77,6 +85,8 @@ class BackgroundSubtraction(Segmenter):
     changed: SceneChange | None = None
     sensor: SensorCard | None = None
     transient_objects: tuple[Fixture, ...] = ()
+    n_animals: int = 1
+    n_animals_share: float = 1.0
 
     @cached_property
     def grid(self) -> Camera:
@@ -113,7 +123,8 @@ class BackgroundSubtraction(Segmenter):
             floor_from=found.origin,
             floor_support=found.support if found.moves else None,
             n_moving=found.n_moving,
-            n_animals=found.n_together,
+            n_animals=self.n_animals if found.n_moving else 0,
+            n_animals_share=self.n_animals_share,
             region_px=region_corners(found.region, self.stride),
             doubts=(*filter(None, [found.doubt]), *self.doubts),
         )
@@ -351,7 +362,8 @@ class BackgroundSubtraction(Segmenter):
             depths = self.level.brought_back(depths)
         for device in self.worn:
             depths = device.cut(depths, self.limit)
-        crops = HeightMaps.blank(n_candidates * len(depths), self.floor.distance_mm)
+        n_ranks = N_OBJECTS if n_candidates > 1 else 1
+        crops = HeightMaps.blank(n_ranks * len(depths), self.floor.distance_mm)
         grid = self.grid
         with threads(parallel):
             in_parallel(
@@ -361,7 +373,7 @@ class BackgroundSubtraction(Segmenter):
                 self.limit,
                 self.on_floor,
                 self.area_mm2,
-                n_candidates,
+                n_ranks,
                 camera_view,
                 kernels.Sight(
                     np.array([grid.fx, grid.fy, grid.cx, grid.cy]),
@@ -375,7 +387,17 @@ class BackgroundSubtraction(Segmenter):
         if self.stride > 1:  # in pixels of the full image
             for values, factor in ((crops.origin, 1), (crops.step, 1), (crops.n_px, self.stride)):
                 values *= self.stride * factor
-        return crops
+        if n_ranks == 1:
+            return crops
+        n = len(depths)
+        objects = np.full((n_ranks * n, 4), np.nan)
+        found = np.flatnonzero(crops.moments[:, 0] > 0)
+        objects[found, :3] = self.middles(crops[found], camera_view)
+        objects[found, 3] = crops.blobs.area_mm2[found]
+        crops.objects[:] = np.tile(
+            objects.reshape(n_ranks, n, 4).transpose(1, 0, 2), (n_ranks, 1, 1)
+        )
+        return crops[: n_candidates * n]
 
 
 def at_every_pixel(

@@ -132,6 +132,8 @@ def _camera_centre(points: Array, crop_cameras: Array) -> Array:
 
 
 CROP = 96  # pixels per side of a height map
+N_OBJECTS = 4  # components of a frame that are described
+ANIMAL_HEIGHTS = (0.4, 2.5)  # mean height of an animal from the floor, over the usual one
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,8 @@ class HeightMaps(Rows):
             from its arm if one is visible.
         distance: (n,) mm from the camera to the origin of the view frame.
         n_blobs: (n,) int64, components of the frame with about the animal's size.
+        objects: (n, N_OBJECTS, 4) centre x, y, z mm, arena frame, and area mm^2 of these
+            components, the most similar first; NaN if absent or not asked for.
     """
 
     heights: NDArray[np.int16]
@@ -163,6 +167,7 @@ class HeightMaps(Rows):
     moments: Array
     distance: Array
     n_blobs: NDArray[np.int64]
+    objects: Array
 
     def __post_init__(self) -> None:
         """Check that the shapes match, as kernels do not."""
@@ -175,6 +180,7 @@ class HeightMaps(Rows):
             ("moments", self.moments, ("n", N_MOMENTS)),
             ("distance", self.distance, ("n",)),
             ("n_blobs", self.n_blobs, ("n",)),
+            ("objects", self.objects, ("n", N_OBJECTS, 4)),
         )
 
     @staticmethod
@@ -193,6 +199,7 @@ class HeightMaps(Rows):
             np.zeros((n, N_MOMENTS)),
             np.full(n, distance_mm),
             np.zeros(n, np.int64),
+            np.full((n, N_OBJECTS, 4), np.nan),
         )
 
     @property
@@ -369,11 +376,13 @@ class Segmenter(ABC):
         camera: the ideal pinhole camera of the images.
         floor: the plane from which heights in a recording's results are measured.
         area_mm2: the animal's usual area in the camera's view, mm^2.
+        n_animals: how many animals are in view at once in the sampled frames.
     """
 
     camera: Camera
     floor: Floor
     area_mm2: float
+    n_animals: int = 1
 
     @abstractmethod
     def extract(

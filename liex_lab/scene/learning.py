@@ -37,6 +37,7 @@ from liex_lab.scene.background import (
 )
 from liex_lab.scene.background_segmenter import BackgroundSubtraction as Scene
 from liex_lab.scene.floor import Array, Depths, Floor, Mask, parts
+from liex_lab.scene.height_maps import ANIMAL_HEIGHTS
 from liex_lab.scene.scene import HIGH_MM, LEAST_MM2, Fixture, fixture_at
 from liex_lab.scene.support_plane import TargetAnimal
 from liex_lab.scene.worn import find_worn
@@ -454,6 +455,8 @@ def learn_scene(
             scene, sample = _scene_of(camera, stride, under, level)
     changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
     scene = replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed)
+    n_animals, share = count_in_sample(scene, sample)
+    scene = replace(scene, n_animals=n_animals, n_animals_share=share)
     scene = replace(scene, sensor=read_sensor(scene, sample))
     if target.stands_on_floor and changed is None:
         scene = replace(scene, transient_objects=find_transient_objects(scene, sample, times_s))
@@ -535,6 +538,38 @@ def _moving_area(scene: Scene, sample: Depths, target: TargetAnimal) -> tuple[fl
         return area, share
     crops = replace(scene, area_mm2=support_plane.mover_mm2).extract(sample, 1.0)
     return support_plane.mover_mm2, float(crops.found.mean())
+
+
+# The number of animals in sampled frames.
+
+
+def count_in_sample(scene: Scene, sample: Depths) -> tuple[int, float]:
+    """How many animals are in view at once in a fifth of the frames that show any.
+
+    Counted are the components of about the animal's size that are 0.4 to 2.5 times as high as usual
+    and do not stand at one position in half of the frames.
+
+    Args:
+        scene: the scene with its animal's area.
+        sample: (n, H, W) float32 mm, frames at its stride, spread over the recording.
+
+    Returns:
+        The number, and the share of the frames with an animal in which as many stand free.
+    """
+    objects = scene.extract(sample, 1.0, n_candidates=2).objects[: len(sample)]
+    known = np.isfinite(objects[..., 0])
+    if not known[:, 1:].any():
+        return 1, 1.0
+    if scene.view.frame == VIEWS[0]:
+        height = objects[..., 2] / np.median(objects[known[:, 0], 0, 2])
+        known &= (height > ANIMAL_HEIGHTS[0]) & (height < ANIMAL_HEIGHTS[1])
+    reach = 0.3 * np.sqrt(scene.area_mm2)
+    for i, k in zip(*np.nonzero(known[:, 1:]), strict=True):  # the first is the animal
+        off = np.linalg.norm(objects[..., :2] - objects[i, k + 1, :2], axis=-1)
+        known[i, k + 1] = (off < reach).any(axis=1).mean() < _OFTEN
+    counts = np.maximum(known.sum(axis=1), 1)
+    n_animals = int(np.percentile(counts, 80, method="lower"))
+    return n_animals, float((counts == n_animals).mean())
 
 
 # The quality card of a sensor.

@@ -399,7 +399,8 @@ class Scene:
         floor_support: share of the moving objects, by volume, that stand on it, 0 to 1; None if too
             little moved.
         n_moving: moving objects of an animal's size in the sampled frames.
-        n_animals: how many of them move in one frame; 0 if none moved.
+        n_animals: how many animals are in view at once; 0 if nothing moved.
+        n_animals_share: share of the sampled frames with an animal in which as many stand free.
         roughness_mm: standard deviation of the ground, with bedding, about the floor's plane, mm;
             None if the ground is not visible.
         region_px: (u, v) corners, pixels, of the polygon that is analysed; empty for the full
@@ -420,6 +421,7 @@ class Scene:
     floor_support: float | None = None
     n_moving: int = 0
     n_animals: int = 0
+    n_animals_share: float = 1.0
     roughness_mm: float | None = None
     region_px: tuple[tuple[float, float], ...] = ()
     outline: Arena = UNKNOWN
@@ -444,6 +446,7 @@ class Scene:
             "region_px": [[round(u, 1), round(v, 1)] for u, v in self.region_px],
             "n_moving": self.n_moving,
             "n_animals": self.n_animals,
+            "n_animals_share": round(self.n_animals_share, 3),
             "thin_above": self.thin_above,
             "fixtures": [fixture.to_dict() for fixture in self.fixtures],
             "doubts": list(self.doubts),

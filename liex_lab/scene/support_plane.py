@@ -50,7 +50,6 @@ class SupportPlane:
         n_moving: moving objects of an animal's size in the sampled frames.
         support: their share, by volume, that stands on this floor, 0 to 1; NaN without any.
         mover_mm2: their median area from the camera, mm^2; NaN without any.
-        n_together: how many of them move in one frame (80 % quantile).
         origin: how the floor was found, see `scene.Scene.floor_from`.
         doubt: a sentence on why this floor may be wrong; empty without doubt.
     """
@@ -61,7 +60,6 @@ class SupportPlane:
     n_moving: int
     support: float
     mover_mm2: float = float("nan")
-    n_together: int = 0
     origin: str = LARGEST
     doubt: str = ""
 
@@ -181,12 +179,7 @@ def find_support_plane(scene: SampledScene, stated: Floor | None = None) -> Supp
     )
     if not movers:
         return support_plane
-    n_together = np.unique([mover.frame for mover in movers], return_counts=True)[1]
-    return replace(
-        support_plane,
-        mover_mm2=float(np.median([mover.area_mm2 for mover in movers])),
-        n_together=int(np.percentile(n_together, 80, method="lower")),
-    )
+    return replace(support_plane, mover_mm2=float(np.median([mover.area_mm2 for mover in movers])))
 
 
 def still_object(

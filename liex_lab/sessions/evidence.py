@@ -203,7 +203,7 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
         columns = []
         for name in COLUMNS:
             expected = getattr(empty, name)
-            later = name in ("covered", "beside", "behind", "part_mm", "repeats")
+            later = name in ("covered", "beside", "behind", "part_mm", "repeats", "objects")
             found = expected if later and name not in arrays else arrays[name]
             if (found.shape, found.dtype) != (expected.shape, expected.dtype):
                 raise ValueError(
@@ -426,6 +426,7 @@ def track_of(session: Session, skeleton: Skeleton | None = None) -> Track:
         "n_foreground_px",
         "p_flip",
         "bridged",
+        "n_animals",
     ):
         if name in frames:
             getattr(track, name)[:] = frames[name].to_numpy()

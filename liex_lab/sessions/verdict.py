@@ -15,7 +15,7 @@ import numpy as np
 
 from liex_lab.runtime.text_files import loose_json
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Tracked
 
 NEEDS_REVIEW = "needs review"
 CAUTION = "note"
@@ -32,13 +32,13 @@ class Verdict:
         n_posed: frames with a measured pose.
         n_trusted: frames with a measured pose that nothing contradicts.
         expected_error_mm: median predicted joint error of the measured poses, mm; None without any.
-        n_animals: number of moving objects of the animal's size in view at once; 0 if no frame has
-            a pose.
+        n_animals: animals in view at once; 0 if no frame has a pose.
         reasons: why the session needs review, such as a scene that does not fit the plan; empty if
             it does not.
         cautions: further doubts.
         accepted: whether the plan accepts misfits (`estimation.accept_misfit`).
         n_hidden: frames in which the animal is behind or under something.
+        n_animals_share: share of the frames with an animal in view that show this number.
     """
 
     n_frames: int
@@ -51,29 +51,31 @@ class Verdict:
     cautions: tuple[str, ...] = ()
     accepted: bool = False
     n_hidden: int = 0
+    n_animals_share: float = 1.0
 
     @staticmethod
     def of(
-        track: Track,
+        tracked: Tracked,
         observations: Observations,
         *,
         misfits: Sequence[str] = (),
         doubts: Sequence[str] = (),
-        n_animals: int = 1,
+        n_measured: int = 1,
         cautions: Sequence[str] = (),
         accepted: bool = False,
     ) -> "Verdict":
         """The verdict on a track.
 
         Args:
-            track: one row for every frame.
+            tracked: the track, and how many animals are in view.
             observations: the observations.
             misfits: how the scene does not fit the plan.
             doubts: why its scene or its clock is unreliable.
-            n_animals: number of animals in the frames used for learning the scene.
+            n_measured: how many animals of the recording are measured.
             cautions: further doubts.
             accepted: whether the plan accepts misfits.
         """
+        track = tracked.track
         n_hidden = int((track.flag == "hidden").sum())
         n_depth = (
             int(observations.has_depth.sum()) - n_hidden
@@ -84,8 +86,14 @@ class Verdict:
         n_doubtful = int((track.flag == "doubtful").sum())
         errors = track.predicted_error_mm[track.observed]
         reasons = [*misfits, *doubts]
+        crowded = int((track.n_animals > n_measured).sum())
+        if tracked.n_animals > n_measured:
+            reasons.append(
+                f"{tracked.n_animals} animals are in view at once, more than one in {crowded:,} "
+                f"frames, and {n_measured} of them is followed, whose poses there are not trusted"
+            )
         # of all frames with depth
-        if n_trusted < 0.2 * n_depth:
+        elif n_trusted < 0.2 * n_depth:
             reasons.append(f"an animal is measured in {n_trusted} of {n_depth} frames only")
         # of the frames with an object of the animal's size in view
         elif n_trusted < 0.5 * n_in_view:
@@ -94,11 +102,9 @@ class Verdict:
                 "are measured and trusted"
             )
         notes = list(cautions)
-        if n_animals > 1:
-            notes.append(f"{n_animals} animals are in view and one of them is followed")
         if n_hidden:
             notes.append(f"the animal is hidden in {n_hidden:,} frames")
-        if n_doubtful > 0.05 * track.n_frames:
+        if n_doubtful > max(0.05 * track.n_frames, crowded):
             notes.append(f"{n_doubtful} poses are doubtful")
         return Verdict(
             track.n_frames,
@@ -106,11 +112,12 @@ class Verdict:
             n_posed,
             n_trusted,
             float(np.median(errors)) if len(errors) else None,
-            n_animals if n_posed else 0,
+            tracked.n_animals if n_posed else 0,
             tuple(reasons),
             tuple(notes),
             accepted,
             n_hidden,
+            round(tracked.n_animals_share, 3),
         )
 
     @property

@@ -130,6 +130,7 @@ class Rows:
             "p_flip": track.p_flip,
             "bridged": track.bridged,
             "flag": track.flag,
+            "n_animals": track.n_animals,
         }
 
     def _in_arena(self) -> tuple[Array, pa.DictionaryArray]:

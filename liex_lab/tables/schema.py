@@ -412,7 +412,7 @@ class SessionTables(Protocol):
 
 # columns that schema 1 lacks; columns added by later schemas are listed here as well
 _LATER = {
-    "frames": {"wall_distance_mm", "zone", "p_flip", "bridged", "pulse_index"},
+    "frames": {"wall_distance_mm", "zone", "p_flip", "bridged", "pulse_index", "n_animals"},
     "poses": {"sd_xy_mm", "sd_z_mm"},
     "rotations": set(ROOT_COVARIANCES),
     "gaps": {"x_mm", "y_mm"},

@@ -21,6 +21,7 @@ For an ongoing recording, `OnlineTracker` uses the same methods over a sliding w
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from liex_lab.recordings.timestamps import GAP_FACTOR, median_step
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation, cost_of_the_other
+from liex_lab.tracking.counting import count_animals
 from liex_lab.tracking.observations import Array, Observations, reversed_pose
 from liex_lab.tracking.smoother import TrackingParameters, smooth
 from liex_lab.tracking.track import (
@@ -150,12 +152,16 @@ def track_whole(
         The track (n rows) and the flips, those found and those of `corrections`, in order of time.
     """
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
+    count = count_animals(observed)
+    if np.isfinite(observed.objects).any():  # which sessions of earlier versions lack
+        subject = replace(subject, n_animals=count.n_animals)
     path, doubt = _associate(subject, observed, tuning, allocate)
     error = observed.along(observed.error_mm, path)
     applied = [(flip.start, flip.stop) for flip in corrections if not flip.undone_at]
     turned = _turn_round(observed, path, doubt, applied)
     usual_px = usual_pixels(observed, path)
     track = Track.empty(subject.skeleton, observed.times_ns, allocate=allocate)
+    track.n_animals[:] = count.in_view
     cuts = _half_turns(observed, path, turned, applied)
     in_view = share_in_view(observed, path, usual_px)
     # a pose fitted to the visible part is off by about the hidden length
@@ -198,7 +204,7 @@ def track_whole(
     ordered = sorted(
         [*_flips(observed, track), *corrections], key=lambda flip: (flip.start, flip.source)
     )
-    return Tracked(track, tuple(ordered), tuple(cuts))
+    return Tracked(track, tuple(ordered), tuple(cuts), subject.n_animals, count.share)
 
 
 def _associate(
@@ -243,7 +249,7 @@ def _bridge_and_flag(
     # the behaviour of an animal that stays half hidden is unknown
     bridged &= ~unknown | whole_gaps(seconds, measured, subject.bridge_s)
     hidden |= unknown & ~bridged
-    strayed |= doubted(subject, observed, path, in_view, usual_px)
+    strayed |= doubted(subject, observed, path, in_view, usual_px, track.n_animals)
     masks = measured | copies, bridged, strayed
     for rows in blocks(len(observed), _BLOCK):
         part = track[rows]

@@ -18,6 +18,7 @@ from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import Allocator, Rows, blocks
+from liex_lab.scene.height_maps import N_OBJECTS
 
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
@@ -51,6 +52,8 @@ class Observations(Rows):
         behind: (n, H) share of the component's outline that borders on something nearer.
         part_mm: (n, H) largest residual of a part of the body, mm.
         repeats: (n,) True if the depth image is bit-identical to the previous one.
+        objects: (n, N_OBJECTS, 4) centre x, y, z mm, arena frame, and area mm^2 of the components
+            of about the animal's size.
     """
 
     skeleton: Skeleton
@@ -71,6 +74,7 @@ class Observations(Rows):
     behind: Small
     part_mm: Small
     repeats: NDArray[np.bool_]
+    objects: Small
 
     @staticmethod
     def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
@@ -110,6 +114,7 @@ class Observations(Rows):
             nothing(),
             nothing(),
             np.zeros(n, np.bool_),
+            np.full((n, N_OBJECTS, 4), np.nan, np.float32),
         )
 
     def put_pose(self, h: int, pose: Pose) -> None:

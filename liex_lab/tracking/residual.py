@@ -312,8 +312,7 @@ class SampleFit:
         residual_mm: distance between rendered body and reading, mm; NaN if they hardly overlap.
         covered: share (0 to 1) of the silhouette that the body covers.
         beside: share (0 to 1) of the body outside the silhouette.
-        n_animals: how many objects of the animal's size, whose outline and surface its body fits,
-            are in view at once.
+        n_animals: how many animals are in view at once.
     """
 
     n_frames: int
@@ -368,27 +367,6 @@ class SampleFit:
             ),
         )
         return [sentence for contradicts, sentence in contradictions if contradicts]
-
-
-def count_animals(
-    first: BodyAgreement, second: BodyAgreement, rows: NDArray[np.int64], n: int
-) -> int:
-    """How many objects of the animal's size are in view at once: 1 or 2.
-
-    Args:
-        first: agreement of the animal's own poses with the depth images of n frames.
-        second: the same of the next object of about its size, in m of these frames.
-        rows: (m,) which frames those are.
-        n: number of frames.
-    """
-    if not len(rows) or not n:
-        return 1
-    alike = (
-        (second.residual_mm <= 1.5 * finite_median(first.residual_mm, 0.0))
-        & (second.covered >= 0.8 * np.median(first.covered))
-        & (second.beside <= _MOST_BESIDE)  # a shorter animal fills less of a body of this length
-    )
-    return 2 if alike.sum() >= max(2.0, 0.2 * n) else 1  # of the frames: excludes a passing hand
 
 
 # Occlusion correction: an animal with one end hidden is shifted along its axis.

@@ -59,6 +59,7 @@ class Track(Rows):
         bridged: (n,) not measured, but interpolated between measurements shortly before and
             after.
         flag: (n,) a word of the column `flag` of the table `frames`.
+        n_animals: (n,) int64, animals in view.
     """
 
     skeleton: Skeleton
@@ -82,6 +83,7 @@ class Track(Rows):
     p_flip: Array
     bridged: NDArray[np.bool_]
     flag: NDArray[np.str_]
+    n_animals: NDArray[np.int64]
 
     @staticmethod
     def empty(
@@ -143,6 +145,7 @@ class Track(Rows):
             unknown(),
             column(False, np.bool_),
             column(flag, "<U12"),
+            column(0, np.int64),
         )
 
     def put_pose(self, rows: NDArray[np.int64], pose: Pose) -> None:
@@ -239,18 +242,22 @@ def ends_of(spans: Iterable[tuple[int, int]]) -> list[int]:
 
 @dataclass(frozen=True)
 class Tracked:
-    """A track and its exchanges of head and tail.
+    """A track, its exchanges of head and tail, and the animals in view.
 
     Attributes:
         track: one row for every frame.
         flips: spans of exchanged or uncertain head and tail, in order of time.
         cuts: first rows of stretches that were smoothed by themselves, since a person's exchange
             makes a half turn there.
+        n_animals: animals in view at once.
+        n_animals_share: share of the frames with an animal in view that show this number.
     """
 
     track: Track
     flips: tuple[Flip, ...]
     cuts: tuple[int, ...] = ()
+    n_animals: int = 1
+    n_animals_share: float = 1.0
 
 
 # The subject of a track.
@@ -275,7 +282,8 @@ class Subject:
         unseen: remaining standard deviations, over the length, of the joints' height and of their
             position along the body after fitting a session's own shape; None uses those of
             `Motion`.
-        n_animals: how many animals are in view at once, one of which is tracked.
+        n_animals: how many animals are in view at once.
+        n_measured: how many of them are measured.
     """
 
     skeleton: Skeleton
@@ -288,6 +296,7 @@ class Subject:
     stretch_sd: float | None = None
     unseen: tuple[float, float] | None = None
     n_animals: int = 1
+    n_measured: int = 1
 
 
 # Gaps between measured frames, in seconds, and runs of frames.

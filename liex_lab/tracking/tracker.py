@@ -30,12 +30,10 @@ from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Array, Observations
 from liex_lab.tracking.own_shape import OwnShape, StatedShape, fit_shape
 from liex_lab.tracking.residual import (
-    BodyAgreement,
     BodyResidual,
     OcclusionCorrection,
     SampleFit,
     behind_something,
-    count_animals,
 )
 from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Flip, Subject, Tracked
@@ -140,7 +138,7 @@ class FrameTracker:
             finite_median(agreement.residual_mm, np.nan),
             float(np.median(agreement.covered)),
             float(np.median(agreement.beside)),
-            _count(estimator, scene, shown, size, body, agreement, crops.n_blobs),
+            scene.n_animals,
         )
         return FrameTracker(
             estimator,
@@ -203,6 +201,7 @@ class FrameTracker:
         # kernels distribute frames over cores: with one frame the others would idle
         with threads(len(frames) > 1):
             hypotheses = self.estimator.hypotheses(depths, self.scene, self.size)
+            observed.objects[:] = hypotheses[0].crops.objects
             poses = [self._put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
             self._put_agreement(observed, hypotheses, poses, self.scene.cleared(depths))
         if self.noisy:
@@ -328,39 +327,6 @@ def _whole(
     shown = np.where(estimates.found, crops.n_px, np.nan)
     share = visible_share(behind, shown, median_of_whole(shown, behind), 0)
     return ~estimates.found | (share >= WHOLE)
-
-
-def _count(
-    estimator: PoseEstimator,
-    scene: Segmenter,
-    sample: NDArray[np.float32],
-    size: float,
-    body: BodyResidual,
-    first: BodyAgreement,
-    n_candidates: NDArray[np.int64],
-) -> int:
-    """How many animals are in view at once in a sample (n, H, W) mm of frames with an animal.
-
-    Always 1 for hands, whose depth images always contain ends of other objects.
-    """
-    if not isinstance(scene, BackgroundSubtraction):
-        return 1
-    unsure = np.flatnonzero(n_candidates > 1)
-    # frames in which animals are counted
-    rows = unsure[np.linspace(0, len(unsure) - 1, min(len(unsure), 24)).astype(int)]
-    if not len(rows):
-        return 1
-    other = estimator.hypotheses(sample[rows], scene, size)[2]
-    there = other.found
-    pose = other.chosen.pose.moved(scene.floor.T_arena_camera)[there]
-    crops = other.crops[there]
-    if there.any():  # another animal has its own girth and size
-        body = BodyResidual.fit(
-            Surface.of(estimator.skeleton), pose, crops, scene, body.camera_view
-        )
-    # scaled from the inspected frames to all frames
-    n = len(n_candidates) * len(rows) // len(unsure)
-    return count_animals(first, body.agreement(pose, crops, scene), rows[there], n)
 
 
 # Pose hypotheses of patches of depth around animals, like `FrameTracker.observe` of frames.

@@ -418,7 +418,11 @@ def to_track(
     usual_px = usual_pixels(observed, path) if usual_px is None else usual_px
     in_view = share_in_view(observed, path, usual_px)
     unknown = lies_unknown(in_view, doubt)
-    masks = measured & ~unknown, bridged, doubted(subject, observed, path, in_view, usual_px)
+    objects = np.isfinite(observed.objects[..., 0]).sum(axis=1)
+    n_animals = np.clip(objects, observed.known.any(axis=1), subject.n_animals)
+    track.n_animals[:] = n_animals[due]
+    strayed = doubted(subject, observed, path, in_view, usual_px, n_animals)
+    masks = measured & ~unknown, bridged, strayed
     some = (mask[due] for mask in masks)
     mask_and_flag(subject, track, observed[due], path[due], doubt[due], *some)
     hide(track, (unknown & ~bridged)[due])
@@ -615,10 +619,12 @@ def doubted(
     path: NDArray[np.int64],
     in_view: Array,
     usual_px: float,
+    n_animals: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
     """Whether (n,) a pose is doubtful because of its depth image.
 
-    The image contradicts the pose, the animal is partly hidden, or it touches another animal.
+    The image contradicts the pose, the animal is partly hidden, or it is not known which of several
+    animals it is.
 
     Args:
         subject: the animal of the track.
@@ -626,8 +632,9 @@ def doubted(
         path: (n,) hypothesis of each frame, `NONE` if it was skipped.
         in_view: (n,) visible share of the animal.
         usual_px: its usual number of pixels.
+        n_animals: (n,) animals in view.
     """
     found = contradicted(observed, path, subject.length_mm) | (in_view < WHOLE)
-    if subject.n_animals > 1:
-        found |= together(observed, path, usual_px)
+    if subject.n_animals > subject.n_measured:
+        found |= together(observed, path, usual_px) | (n_animals > subject.n_measured)
     return found

@@ -35,6 +35,7 @@ class Window:
             np.zeros((1, 9)),
             np.array([distance]),
             np.ones(1, np.int64),
+            np.full((1, 4, 4), np.nan),
         )
         self.look = scene.crop_cameras(crops, camera_view)[0]
         self.camera, self.origin, self.step = camera, origin[0], step

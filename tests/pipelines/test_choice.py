@@ -20,7 +20,7 @@ from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.scene.hand_segmenter import HandSegmenter
 from liex_lab.simulation.scenes.catalogue import film
-from liex_lab.tracking.residual import BodyAgreement, SampleFit, count_animals
+from liex_lab.tracking.residual import SampleFit
 
 GOOD = SampleFit(96, 96, 65.0, 2.0, 1.5, 0.8, 0.03)
 FISH = replace(GOOD, spine_mm=30.0, error_mm=1.0, residual_mm=0.7)
@@ -192,27 +192,6 @@ def test_the_best_of_several_is_the_one_with_the_least_error_for_its_length() ->
     assert best([fish, mouse]) is mouse
     assert best([fish, PlanFit("mouse", GOOD, ("it is too long",)), PlanFit("hand", None)]) is fish
     assert best([]) is None
-
-
-def agreement(n: int, covered: float) -> BodyAgreement:
-    return BodyAgreement(np.full(n, 1.5), np.full(n, covered), np.full(n, 0.05), np.full(n, 3.0))
-
-
-def test_two_animals_are_two_where_the_second_fits_as_well_as_the_first() -> None:
-    rows = np.arange(40)
-    assert count_animals(agreement(96, 0.8), agreement(40, 0.8), rows, 96) == 2
-    assert count_animals(agreement(96, 0.8), agreement(40, 0.3), rows, 96) == 1
-    assert count_animals(agreement(96, 0.8), agreement(5, 0.8), rows[:5], 96) == 1
-    assert count_animals(agreement(96, 0.8), agreement(0, 0.8), rows[:0], 96) == 1
-
-
-def test_an_animal_that_is_shorter_than_the_other_is_counted_and_a_thing_is_not() -> None:
-    """A body of the first one's length lies beside a shorter one, but on a thing nowhere."""
-    rows = np.arange(40)
-    shorter = replace(agreement(40, 0.8), beside=np.full(40, 0.4))
-    assert count_animals(agreement(96, 0.8), shorter, rows, 96) == 2
-    thing = replace(shorter, residual_mm=np.full(40, 11.0))
-    assert count_animals(agreement(96, 0.8), thing, rows, 96) == 1
 
 
 @pytest.mark.nightly

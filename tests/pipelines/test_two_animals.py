@@ -17,7 +17,7 @@ SEED = 3
 ADDRESS = f"synthetic:scene?name=two-animals&seed={SEED}&frames={N_FRAMES}"
 
 
-SAID = "2 animals are in view and one of them is followed"
+SAID = "2 animals are in view at once, more than one in "
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +27,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def session(recording: Path) -> Session:
-    """The session of a run that ends well and reports both animals."""
+    """The session of a run that needs review, and reports both animals."""
     result = CliRunner().invoke(cli.app, ["run", str(recording), "--out", str(recording.parent)])
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 4, result.output
     assert SAID in result.output.strip().splitlines()[-1]
     return Session.open(recording.with_suffix(".liex"))
 
@@ -47,10 +47,18 @@ def test_the_last_lines_and_the_table_of_a_study_report_both(
     assert result.exit_code == 0, result.output
     *_, done, counted = result.output.strip().splitlines()
     assert done.startswith("done")
-    assert f"note: {SAID}" in done
-    assert counted == "1 session: 1 done with cautions"
+    assert f"needs review: {SAID}" in done
+    assert counted == "1 session: 1 done, needs review"
     (table,) = tmp_path.rglob("study.csv")
     assert "2 animals are in view" in table.read_text()
+
+
+def test_no_pose_of_one_of_two_animals_is_trusted(session: Session) -> None:
+    assert (session.frames["n_animals"] == 2).mean() > 0.9
+    assert not (session.frames["flag"][session.frames["n_animals"] > 1] == "").any()
+    verdict = session.metadata["verdict"]
+    assert (verdict["n_animals"], verdict["look_at_it"]) == (2, True)
+    assert verdict["n_animals_share"] > 0.9
 
 
 def test_the_report_shows_the_one_that_is_not_measured_where_it_is(session: Session) -> None:

@@ -100,6 +100,7 @@ class WalkingMouse:
             p_flip=np.zeros(n),
             bridged=np.zeros(n, bool),
             flag=np.full(n, "", "<U12"),
+            n_animals=np.ones(n, np.int64),
         )
         return forget(track, self.lost)
 
