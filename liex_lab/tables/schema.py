@@ -139,6 +139,8 @@ TABLES: dict[str, tuple[Column, ...]] = {
     for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "sessions")
 }
 FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS = TABLES.values()
+# of sessions with several animals in one arena only
+INTERACTIONS = table_columns("interactions") + table_columns("interaction_totals")
 POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
@@ -150,7 +152,7 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    every = chain(*TABLES.values(), POINTS, branching, swimming, walking)
+    every = chain(*TABLES.values(), INTERACTIONS, POINTS, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 
 
@@ -389,7 +391,7 @@ _LATER = {
     "gaps": {"x_mm", "y_mm"},
 }
 _FEW = 10_000
-_SPANS = {"bouts", "gaps", "flips"}
+_SPANS = {"bouts", "gaps", "flips", "interactions"}
 # our types in Parquet, and their kinds in pandas
 _STORED = {"string": "BYTE_ARRAY", "float64": "DOUBLE", "int64": "INT64", "bool": "BOOLEAN"}
 _KINDS = {"string": "O", "float64": "f", "int64": "i", "bool": "b"}
