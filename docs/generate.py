@@ -249,6 +249,20 @@ def vocabularies() -> str:
     return "\n".join(lines)
 
 
+def interactions() -> str:
+    """The words for what one animal does to another, with the default limits."""
+    from liex_lab.actions.vocabulary import INTERACTIONS
+    from liex_lab.behaviour.interactions import definitions
+    from liex_lab.plan.sections import InteractionThresholds
+
+    meanings = definitions(InteractionThresholds())
+    rows = [
+        f"| `{word}` | {'mutual' if one.mutual else ''} | {meanings[word]} | {one.mabe} |"
+        for word, one in INTERACTIONS.items()
+    ]
+    return "\n".join(["| word | | meaning | in MABe |", "|---|---|---|---|", *rows, ""])
+
+
 def python_interface() -> str:
     """Functions and classes with their signatures and docstrings."""
     lines: list[str] = []
@@ -319,6 +333,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "exports": exports,
     "scores": scores,
     "vocabularies": vocabularies,
+    "interactions": interactions,
     "python-interface": python_interface,
 }
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.evaluation.scenes import evaluate_scenes
     from liex_lab.pipelines.evaluation.tracking import evaluate_tracking
     from liex_lab.pipelines.live import follow_live
-    from liex_lab.pipelines.points import import_points
+    from liex_lab.pipelines.points import import_animals, import_points
     from liex_lab.pipelines.session import run_demo, run_session
     from liex_lab.pipelines.study.status import SessionStatus
     from liex_lab.pipelines.sync import sync_session
@@ -40,6 +40,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "draw_figures": "drawing",
     "export_video": "drawing",
     "follow_live": "live",
+    "import_animals": "points",
     "import_points": "points",
     "run_demo": "session",
     "sync_session": "sync",
@@ -90,6 +91,7 @@ __all__ = [  # noqa: RUF022 - in the order of the manual
     "sync_session",
     "follow_live",
     "import_points",
+    "import_animals",
     "run_demo",
     "draw_figures",
     "compare_groups",

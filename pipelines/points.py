@@ -18,11 +18,12 @@ from liex_lab.dashboards.replay.layouts import replay_blueprint
 from liex_lab.dashboards.report.report import write_views
 from numpy.typing import NDArray
 
+from liex_lab.behaviour.interactions import Individual, Interactions, find_interactions
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.catalog import sha256
 from liex_lab.errors import LiexError, refuse
-from liex_lab.exchange.points import PointNames, Points, read_points
+from liex_lab.exchange.points import PointNames, Points, read_animals, read_points
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan, study
@@ -198,7 +199,63 @@ def import_points(
     Raises:
         LiexError: the points cannot be used; the message gives advice.
     """
-    started = time.perf_counter()
+    table = PointNames.load(names, fps=fps, individual=individual)
+    progress(0, None, "reading the points")
+    points = [read_points(file, table)]
+    return _write_sessions(file, plan, out, table, points, overwrite, report, progress)[0]
+
+
+def import_animals(
+    file: str | Path,
+    plan: Plan | str = "mouse",
+    out: str | Path = ".",
+    *,
+    names: str | Path | None = None,
+    fps: float | None = None,
+    individual: str | None = None,
+    overwrite: bool = False,
+    report: bool = True,
+    progress: Progress = silent,
+) -> list[Path]:
+    """Make a session of each animal in a file of 3D points; returns their folders.
+
+    The animals are in one arena: each session has the tables `interactions` and
+    `interaction_totals` of all of them. Otherwise like `import_points`.
+
+    Args:
+        file: the points; see `liex_lab.exchange.points.read_points`.
+        plan: the animal, rules, and facts about the session, or the name of a bundled plan.
+        out: parent of the session folders `<file's name>-<animal>.liex`, or of
+            `<file's name>.liex` for one animal.
+        names: a table of names (TOML); None if points have our joints' names, in mm, z up.
+        fps: frames per second, for a file without times.
+        individual: the only animal to read; None for all.
+        overwrite: replace existing sessions.
+        report: whether to write the reports with their figures.
+        progress: receives progress reports.
+
+    Raises:
+        LiexError: the points cannot be used; the message gives advice.
+    """
+    table = PointNames.load(names, fps=fps, individual=individual)
+    progress(0, None, "reading the points")
+    points = read_animals(file, table)
+    return _write_sessions(file, plan, out, table, points, overwrite, report, progress)
+
+
+def _write_sessions(
+    file: str | Path,
+    plan: Plan | str,
+    out: str | Path,
+    names: PointNames,
+    animals: Sequence[Points],
+    overwrite: bool,
+    report: bool,
+    progress: Progress,
+) -> list[Path]:
+    """A session of each animal, and the interactions of several; nothing is written if the points
+    of one of them cannot be used.
+    """
     plan = plan if isinstance(plan, Plan) else Plan.load(plan)
     skeleton, source = Skeleton.load(plan.animal.skeleton), Path(file)
     if not skeleton.is_chain:
@@ -208,19 +265,59 @@ def import_points(
         )
     is_ruled = plan.actions.model is None and skeleton.name == "mouse"
     plan = plan.with_settings(["replay.depth=none", *["actions.model=rules"] * is_ruled])
-    folder = durable.inside(Path(out), plan.session.name or source.stem, ".liex")
-    check_unused(folder, overwrite)
-    progress(0, None, "reading the points")
-    table = PointNames.load(names, fps=fps, individual=individual)
-    points = read_points(source, table)
-    mapped = table.of_joints(skeleton.names, points.names)
-    track = track_of_points(points, skeleton, mapped, plan.tracking.bridge_s)
-    check_track(track, plan)
+    named = plan.session.name or source.stem
+    alone = len(animals) == 1
+    folders = [
+        durable.inside(Path(out), named if alone else f"{named}-{one.individual}", ".liex")
+        for one in animals
+    ]
+    for folder in folders:
+        check_unused(folder, overwrite)
+    mapped = names.of_joints(skeleton.names, animals[0].names)
+    tracks = []
+    for one in animals:
+        try:
+            track = track_of_points(one, skeleton, mapped, plan.tracking.bridge_s)
+            check_track(track, plan)
+        except LiexError as error:
+            raise error if alone else LiexError(f"of the animal {one.individual} {error}") from None
+        tracks.append(track)
+    together = None
+    if not alone:
+        progress(0, None, "finding the interactions")
+        together = find_interactions(
+            animals[0].time_s,
+            [
+                Individual.of_track(one.individual, track)
+                for one, track in zip(animals, tracks, strict=True)
+            ],
+            plan.interactions,
+        )
+    return [
+        _write(source, folder, points, track, plan, names, mapped, together, overwrite, report)
+        for folder, points, track in zip(folders, animals, tracks, strict=True)
+    ]
+
+
+def _write(
+    source: Path,
+    folder: Path,
+    points: Points,
+    track: Track,
+    plan: Plan,
+    names: PointNames,
+    mapped: Mapping[str, Sequence[str]],
+    together: Interactions | None,
+    overwrite: bool,
+    report: bool,
+) -> Path:
+    """The session of one animal."""
+    started = time.perf_counter()
     n_posed, n_trusted = int(track.observed.sum()), int((track.flag == "").sum())
-    derived = [joint for joint in skeleton.names if joint not in mapped]
+    derived = [joint for joint in track.skeleton.names if joint not in mapped]
     with SessionWriter(
         folder,
-        _provenance(source, points, track, plan),
+        _provenance(source, points, track, plan, together is None),
         overwrite=overwrite,
         blueprint=replay_blueprint,
         report=write_views if report else None,
@@ -242,22 +339,28 @@ def import_points(
                 "joints": mapped,
                 "derived_joints": derived,
                 "floor_mm": round(points.floor_mm, 3),
-                "floor_origin": "estimated" if table.floor is None else "stated",
+                "floor_origin": "estimated" if names.floor is None else "stated",
             },
         )
-        return conclude(writer, plan, {"prepare": time.perf_counter() - started, "track": 0.0}).path
+        timings = {"prepare": time.perf_counter() - started, "track": 0.0}
+        return conclude(writer, plan, timings, together).path
 
 
-def _provenance(source: Path, points: Points, track: Track, plan: Plan) -> Provenance:
-    """Provenance of imported points; its camera is a view from above for the replay."""
+def _provenance(source: Path, points: Points, track: Track, plan: Plan, alone: bool) -> Provenance:
+    """Provenance of imported points; its camera is a view from above for the replay.
+
+    Of several animals each has a session and a subject of its own.
+    """
     low, high = (f(track.joints_mm, axis=(0, 1)) for f in (np.nanmin, np.nanmax))
     far = float(max(1000.0, 4.0 * high[2]))
     width, height, _ = np.clip(np.ceil(high - low) + 100.0, 100.0, 30_000.0).astype(int).tolist()
     found, stated = study.find_subject(source.with_suffix("")), plan.session
     subject = {name: getattr(stated, name) for name in (*SUBJECT, *ALSO)}
     subject["subject_id"] = stated.subject_id or (found.id if found.origin else "")
+    own = "" if alone else f"-{points.individual}"
+    subject["subject_id"] = f"{subject['subject_id'] or ('' if alone else source.stem)}{own}"
     return Provenance(
-        durable.storable(stated.name or source.stem),
+        durable.storable(f"{stated.name or source.stem}{own}"),
         track.skeleton,
         Camera(far, far, width / 2, height / 2, width=width, height=height, source="none"),
         SE3(np.diag([1.0, -1.0, -1.0]), np.array([*(low + high)[:2] / 2.0, far])),

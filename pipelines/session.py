@@ -31,6 +31,7 @@ from liex_lab.dashboards.report.report import write_views
 from liex_lab.actions import ethogram, timeline, vocabulary
 from liex_lab.behaviour import summary
 from liex_lab.behaviour.bouts import recognise
+from liex_lab.behaviour.interactions import Interactions
 from liex_lab.catalog import DEMO, find_sample
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.optics.camera import unusual_centre, unusual_lens
@@ -567,12 +568,30 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
     return verdict
 
 
-def conclude(writer: SessionWriter, plan: Plan, timings: dict[str, float]) -> Session:
-    """Measure the behaviour and move the session to its folder; returns the finished session."""
+def conclude(
+    writer: SessionWriter,
+    plan: Plan,
+    timings: dict[str, float],
+    together: Interactions | None = None,
+) -> Session:
+    """Measure the behaviour and move the session to its folder; returns the finished session.
+
+    Args:
+        writer: has all frames and their track.
+        plan: rules and action model.
+        timings: seconds of each part of the work so far.
+        together: the interactions of all animals of the arena; None for one animal.
+    """
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes, problems=_refused_sentence(notes))
     memory.release_memory()
-    return writer.close(timings_s=timings, **behaviour.for_session())
+    closing = behaviour.for_session()
+    if together is not None:
+        more = together.for_session(writer.origin.name)
+        closing["results"] |= more["results"]
+        closing["columns"] += more["columns"]
+        closing["record"] |= more["record"]
+    return writer.close(timings_s=timings, **closing)
 
 
 def measure_behaviour(

@@ -1,4 +1,5 @@
-"""Vocabularies of the bundled ethograms: definitions of the words, and limits of their bouts.
+"""Vocabularies of the bundled ethograms: definitions of the words, and limits of their bouts;
+words for what one animal does to another (`INTERACTIONS`).
 
 A `Definition` is a sentence and its measurable limits. The numbers in the sentence, the clause
 printed after it and the check of every bout (`behaviour.bouts`) all come from these limits.
@@ -250,6 +251,107 @@ def printed_meanings(skeleton: str, kept: Mapping[str, str]) -> dict[str, str]:
         word: own[word].printed if word in own and own[word].sentence == meaning else meaning
         for word, meaning in kept.items()
     }
+
+
+class Interaction(NamedTuple):
+    """The definition of a word for what one animal does to another.
+
+    Attributes:
+        meaning: the sentence; names in braces are settings of the plan's section `interactions`.
+        mabe: its name in the MABe challenge of 2025; '' if that has none.
+        mutual: both animals do it.
+        layered: it may happen at the same time as others; of those that are not layered, one
+            animal does one at a time to another, the first in the order of `INTERACTIONS`.
+        not_in: words in whose frames a layered one is not named.
+    """
+
+    meaning: str
+    mabe: str = ""
+    mutual: bool = False
+    layered: bool = False
+    not_in: tuple[str, ...] = ()
+
+
+INTERACTIONS: dict[str, Interaction] = {
+    "mount": Interaction(
+        "the agent's chest lies over the target's trunk, {mount_above_mm:g} mm or more above its "
+        "mid-axis, and both head the same way within {mount_angle_rad:g} rad",
+        "mount",
+    ),
+    "huddle": Interaction(
+        "both rest together: their trunks touch (skins within {contact_mm:g} mm) for {huddle_s:g} "
+        "s or more, and both are slower than {still_mm_s:g} mm/s",
+        "huddle",
+        mutual=True,
+    ),
+    "chase": Interaction("follows faster than {fast_mm_s:g} mm/s in the median", "chase"),
+    "follow": Interaction(
+        "both go faster than {moving_mm_s:g} mm/s, the agent's nose is within {follow_mm:g} mm of "
+        "where the target's tail base was in the last {follow_s:g} s, and it heads as the target "
+        "did there within {follow_angle_rad:g} rad",
+        "follow",
+    ),
+    "nose_to_nose": Interaction(
+        "both noses are within {nose_mm:g} mm of each other, each nearest to the other's front "
+        "quarter, and one of the heads points at the other nose within {nose_angle_rad:g} rad",
+        "sniffface",
+        mutual=True,
+    ),
+    "nose_to_tail_base": Interaction(
+        "the agent's nose is within {nose_mm:g} mm of the target's tail base, nearest to its rear "
+        "quarter, and the head points there within {nose_angle_rad:g} rad",
+        "sniffgenital",
+    ),
+    "nose_to_side": Interaction(
+        "the agent's nose is within {contact_mm:g} mm of the skin of the target's trunk",
+        "sniffbody",
+    ),
+    "side_by_side_same": Interaction(
+        "noses and tail bases are within {side_by_side_mm:g} mm of each other",
+        mutual=True,
+        layered=True,
+        not_in=("mount",),
+    ),
+    "side_by_side_opposite": Interaction(
+        "each nose is within {side_by_side_mm:g} mm of the other's tail base",
+        mutual=True,
+        layered=True,
+        not_in=("mount",),
+    ),
+    "contact": Interaction(
+        "the skins are within {contact_mm:g} mm of each other", mutual=True, layered=True
+    ),
+    "approach": Interaction(
+        "the agent goes towards the target within 45 degrees, faster than {moving_mm_s:g} mm/s and "
+        "than the target towards it, and nears it as fast, until the skins are within "
+        "{near_mm:g} mm",
+        "approach",
+        layered=True,
+    ),
+    "escape": Interaction(
+        "leaves, and is faster than {fast_mm_s:g} mm/s at some time", "escape", layered=True
+    ),
+    "leave": Interaction(
+        "the agent goes away from the target within 45 degrees, faster than {moving_mm_s:g} mm/s "
+        "and than the target from it, and parts from it as fast, from skins within {near_mm:g} mm "
+        "until they are farther apart",
+        "disengage",
+        layered=True,
+    ),
+    "avoid": Interaction(
+        "the agent goes away faster than {moving_mm_s:g} mm/s while the target, {near_mm:g} to "
+        "{avoid_mm:g} mm from its skin, comes towards it faster than {moving_mm_s:g} mm/s and does "
+        "not follow",
+        "avoid",
+        layered=True,
+        not_in=("follow",),
+    ),
+    "isolated": Interaction(
+        "the agent's skin is farther than {isolated_mm:g} mm from every other for {isolated_s:g} s "
+        "or more; there is no target",
+        layered=True,
+    ),
+}
 
 
 class Fastest(NamedTuple):

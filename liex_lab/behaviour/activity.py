@@ -386,7 +386,8 @@ def visits(
     rows = []
     for zone, inside in zip(zones, inside_zones(frames, zones), strict=True):
         here = inside & observed
-        stays = list(tidy(here, observed, number, time_s, stop_s, rules))
+        least = rules.merge_pauses_s, rules.min_bout_s
+        stays = list(tidy(here, observed, number, time_s, stop_s, *least))
         lengths = [stop_s[b - 1] - time_s[a] for a, b in stays]
         rows.append(
             {

@@ -439,7 +439,8 @@ def find_bouts(
     label = np.full(len(time_s), "", dtype=object)
     for action in ACTIONS:
         free = (label == "") & observed
-        for start, stop in tidy(raw[action] & free, free, number, time_s, stop_s, rules):
+        least = rules.merge_pauses_s, rules.min_bout_s
+        for start, stop in tidy(raw[action] & free, free, number, time_s, stop_s, *least):
             label[start:stop] = action
     return _table(kinematics, label, raw, number, stop_s)
 
@@ -508,7 +509,8 @@ def tidy(
     number: NDArray[np.int64],
     time_s: Array,
     stop_s: Array,
-    rules: MouseRules,
+    merge_s: float,
+    min_s: float,
 ) -> Iterator[tuple[int, int]]:
     """Yield the bouts (start, stop) of a mask: short pauses bridged, then short bouts dropped.
 
@@ -520,7 +522,8 @@ def tidy(
         number: (n,) unbroken stretch of each frame, see `segments`.
         time_s: (n,) times of the frames, s.
         stop_s: (n,) end of each frame's validity, s, see `stop_times`.
-        rules: `merge_pauses_s` and `min_bout_s` are used.
+        merge_s: shorter pauses are bridged, s.
+        min_s: shorter bouts are dropped, s.
 
     Yields:
         Rows [start, stop) of each bout, in order of time.
@@ -532,12 +535,12 @@ def tidy(
         if merged:
             last_start, last_stop = merged[-1]
             bridge = number[last_stop - 1] == which and free[last_stop:start].all()
-            if bridge and time_s[start] - stop_s[last_stop - 1] < rules.merge_pauses_s:
+            if bridge and time_s[start] - stop_s[last_stop - 1] < merge_s:
                 merged[-1] = (last_start, stop)
                 continue
         merged.append((start, stop))
     for start, stop in merged:
-        if stop_s[stop - 1] - time_s[start] >= rules.min_bout_s:
+        if stop_s[stop - 1] - time_s[start] >= min_s:
             yield start, stop
 
 

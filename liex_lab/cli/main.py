@@ -201,7 +201,10 @@ def import_points(
         float | None, typer.Option("--fps", help="Frame rate of a file without times.")
     ] = None,
     individual: Annotated[
-        str | None, typer.Option("--individual", metavar="NAME", help="The animal to read.")
+        str | None,
+        typer.Option(
+            "--individual", metavar="NAME", help="The only animal to read; default: all of them."
+        ),
     ] = None,
     out: OutFolder = Path(),
     settings: Settings = None,
@@ -211,10 +214,11 @@ def import_points(
 ) -> None:
     """Make a session from 3D points of another program (Anipose, DANNCE, movement, CSV).
 
-    It has poses, behaviour tables, a replay and a report; what needs depth is absent.
+    It has poses, behaviour tables, a replay and a report; what needs depth is absent. Of a file
+    with several animals in one arena, each becomes a session, with the interactions of all.
     """
     with progress_bar() as progress:
-        session = api.import_points(
+        sessions = api.import_animals(
             file,
             load_plan(plan, settings or []),
             out,
@@ -224,7 +228,7 @@ def import_points(
             overwrite=overwrite,
             progress=progress,
         )
-    raise typer.Exit(_print_session(session))
+    raise typer.Exit(max(_print_session(session) for session in sessions))
 
 
 @app.command(rich_help_panel=START)

@@ -172,6 +172,18 @@ def read_points(path: str | Path, names: PointNames | None = None) -> Points:
         LiexError: the file cannot be read, holds 2D points, several animals of which none is
             chosen, too few frames, or times that do not increase.
     """
+    return _read(path, names, several=False)[0]
+
+
+def read_animals(path: str | Path, names: PointNames | None = None) -> list[Points]:
+    """The 3D points of every animal in a file, or of the chosen one, see `read_points`.
+
+    All stand on one floor.
+    """
+    return _read(path, names, several=True)
+
+
+def _read(path: str | Path, names: PointNames | None, several: bool) -> list[Points]:
     names = names or PointNames()
     source = Path(path)
     kind = source.suffix.lower()
@@ -181,7 +193,7 @@ def read_points(path: str | Path, names: PointNames | None = None) -> Points:
             f"is {'of another kind' if source.is_file() else 'not a file'}; name such a file"
         )
     try:
-        return _checked(READERS[kind](source), names)
+        return _checked(READERS[kind](source), names, several)
     except LiexError as error:
         raise LiexError(f"{source} {error}") from None
     except ModuleNotFoundError as error:
@@ -193,41 +205,46 @@ def read_points(path: str | Path, names: PointNames | None = None) -> Points:
         ) from None
 
 
-def _checked(held: _Held, names: PointNames) -> Points:
-    """One animal's points in mm, z up; raises LiexError if they cannot be used."""
+def _checked(held: _Held, names: PointNames, several: bool) -> list[Points]:
+    """The points of the chosen animal, or of `several`, in mm, z up.
+
+    Raises:
+        LiexError: they cannot be used.
+    """
     known = [str(name) for name in held.get("individuals", [names.individual or ""])]
-    several = np.asarray(held["points"], float)
+    every = np.asarray(held["points"], float)
     labels = [str(name) for name in held.get("names", ())] or names.points
-    labels = labels or [f"point_{k + 1}" for k in range(several.shape[2])]
-    chosen = names.individual or (known[0] if len(known) == 1 else None)
-    times, frames = held.get("time_s"), held.get("frames", np.arange(len(several)))
+    labels = labels or [f"point_{k + 1}" for k in range(every.shape[2])]
+    alone = names.individual or (known[0] if len(known) == 1 else None)
+    chosen = known if several and names.individual is None else [alone]
+    times, frames = held.get("time_s"), held.get("frames", np.arange(len(every)))
     time_s = np.asarray(frames, float) / (names.fps or 1.0)
     time_s = time_s if times is None else np.asarray(times, float)
     refuse(
         LiexError,
-        (several.shape[-1] != 3, f"holds {_FLAT}"),
+        (every.shape[-1] != 3, f"holds {_FLAT}"),
         (
-            chosen not in known,
+            not {*chosen} <= {*known},
             f"holds the animals {', '.join(known)}; choose one with --individual",
         ),
         (
-            several.shape[2] != len(labels) or len(set(labels)) != len(labels),
-            f"has {several.shape[2]} points, and the names {', '.join(labels)}; each point needs a "
+            every.shape[2] != len(labels) or len(set(labels)) != len(labels),
+            f"has {every.shape[2]} points, and the names {', '.join(labels)}; each point needs a "
             "name of its own",
         ),
         (
             times is None and names.fps is None,
             "has no times, and the frame rate is needed; state it with --fps",
         ),
-        (len(several) < _FEWEST, f"has {len(several)} frames, and {_FEWEST} are needed"),
+        (len(every) < _FEWEST, f"has {len(every)} frames, and {_FEWEST} are needed"),
         (
-            time_s.shape != several.shape[:1],
-            f"has {len(several)} frames and {time_s.size} times; each frame needs its own",
+            time_s.shape != every.shape[:1],
+            f"has {len(every)} frames and {time_s.size} times; each frame needs its own",
         ),
     )
     late = [*np.flatnonzero(~(np.diff(time_s) > 0)), -1][0]
-    which = known.index(str(chosen))
-    points = _upright(several[:, which], names.up) * _UNITS_MM[names.unit]
+    which = [known.index(str(name)) for name in chosen]
+    points = _upright(every[:, which], names.up) * _UNITS_MM[names.unit]
     points[~np.isfinite(points).all(axis=-1)] = np.nan
     heights = points[..., 2][np.isfinite(points[..., 2])]
     refuse(
@@ -241,25 +258,28 @@ def _checked(held: _Held, names: PointNames) -> Points:
         (len(heights) and np.ptp(heights) == 0.0, f"has one height for all points: {_FLAT}"),
     )
     floor = (
-        float(np.nanquantile(np.fmin.reduce(points[..., 2], axis=1), 0.05))
+        float(np.nanquantile(np.fmin.reduce(points[..., 2], axis=2), 0.05))
         if names.floor is None
         else names.floor * _UNITS_MM[names.unit]
     )
     points[..., 2] -= floor
     scores, words = held.get("scores"), held.get("words")
-    return Points(
-        time_s - time_s[0],
-        tuple(labels),
-        points,
-        None if scores is None else np.asarray(scores, float)[:, which],
-        str(chosen),
-        floor,
-        None if words is None else np.asarray(words).astype(str),
-    )
+    return [
+        Points(
+            time_s - time_s[0],
+            tuple(labels),
+            points[:, k],
+            None if scores is None else np.asarray(scores, float)[:, animal],
+            known[animal],
+            floor,
+            None if words is None else np.asarray(words).astype(str),
+        )
+        for k, animal in enumerate(which)
+    ]
 
 
 def _upright(points: Array, up: str) -> Array:
-    """Points (n, P, 3) turned, and not mirrored, so that the upward axis becomes z."""
+    """Points (..., 3) turned, and not mirrored, so that the upward axis becomes z."""
     axis = "xyz".index(up[-1])
     turned = points[..., [(axis + 1) % 3, (axis + 2) % 3, axis]]
     return turned[..., [1, 0, 2]] * [1.0, 1.0, -1.0] if up[0] == "-" else turned

@@ -26,6 +26,7 @@ from liex_lab.plan.sections import (
     CameraOverride,
     Estimation,
     Foreground,
+    InteractionThresholds,
     RecordingOptions,
     Replay,
     Report,
@@ -67,6 +68,7 @@ class Plan(SettingsTable):
         session: metadata of the animal and the session.
         actions: the action recogniser.
         behaviour: thresholds between behaviours.
+        interactions: thresholds of interactions between animals.
         replay: contents of the replays.
         report: files written with the report.
     """
@@ -91,6 +93,7 @@ class Plan(SettingsTable):
     session: SessionFacts = SessionFacts()
     actions: Actions = Actions()
     behaviour: BehaviourThresholds = BehaviourThresholds()
+    interactions: InteractionThresholds = InteractionThresholds()
     replay: Replay = Replay()
     report: Report = Report()
 

@@ -485,6 +485,78 @@ class BehaviourThresholds(SettingsTable):
     min_bout_s: NotNegative = Field(0.23, description="shorter bouts are dropped, after bridging")
 
 
+class InteractionThresholds(SettingsTable):
+    """[interactions]: distances, speeds and times that define interactions between animals of one
+    arena. These are starting values; check them on your own animals. Sources: Live Mouse Tracker
+    (LMT; de Chaumont 2019) and deepof (Bordes 2023); settings without a source are this library's.
+    """
+
+    increasing = ("still_mm_s", "moving_mm_s")
+
+    contact_mm: Positive = Field(
+        10.0, description="skins that are nearer touch, and a nose so near to a side sniffs it"
+    )
+    nose_mm: Positive = Field(
+        26.0, description="largest distance of a nose from a sniffed nose or tail base (LMT: 26)"
+    )
+    nose_angle_rad: Positive = Field(
+        0.785, description="largest angle between a head and what its nose sniffs"
+    )
+    side_by_side_mm: Positive = Field(
+        50.0, description="largest distance of both ends of two bodies side by side (deepof: 50)"
+    )
+    near_mm: Positive = Field(
+        25.0,
+        description="approaches end and leaving begins at this distance of the skins (deepof: 25)",
+    )
+    avoid_mm: Positive = Field(
+        100.0, description="an animal avoids another that comes within this distance of the skins"
+    )
+    isolated_mm: Positive = Field(
+        100.0, description="an animal farther from all others is isolated ..."
+    )
+    isolated_s: NotNegative = Field(1.0, description="... for at least this time")
+    follow_mm: Positive = Field(
+        25.0,
+        description="followers' noses are this near to where the tail base was (deepof: 25) ...",
+    )
+    follow_s: Positive = Field(0.5, description="... within this time (deepof: 0.5) ...")
+    follow_angle_rad: Positive = Field(
+        0.785, description="... and head the same way within this angle (LMT: 45 degrees)"
+    )
+    mount_above_mm: Positive = Field(
+        10.0,
+        description="the chest of a mounting animal is this far above the other's mid-axis ...",
+    )
+    mount_angle_rad: Positive = Field(
+        1.05, description="... and it heads the same way within this angle"
+    )
+    still_mm_s: Positive = Field(20.0, description="animals that huddle are slower ...")
+    huddle_s: NotNegative = Field(2.0, description="... and touch for at least this time")
+    moving_mm_s: Positive = Field(
+        50.0,
+        description="a slower animal stands (LMT: 50): it neither follows, approaches nor leaves",
+    )
+    fast_mm_s: Positive = Field(
+        300.0, description="a faster follower chases, a faster leaving animal escapes"
+    )
+    speed_half_window_s: Positive = Field(
+        0.1, description="speed at time t is measured from t - this to t + this"
+    )
+    before_s: Positive = Field(
+        1.0, description="the agent of a mutual contact came nearer by more in this time before it"
+    )
+    hysteresis: NotNegative = Field(
+        0.2, lt=1, description="an interaction ends beyond its limits by more than this share"
+    )
+    merge_s: NotNegative = Field(
+        0.33, description="shorter interruptions are bridged (LMT: 10 frames)"
+    )
+    min_s: NotNegative = Field(
+        0.23, description="shorter interactions are dropped, after bridging (LMT: 7 frames)"
+    )
+
+
 class Replay(SettingsTable):
     """[replay]: contents of the replays session.rrd and session.mcap."""
 

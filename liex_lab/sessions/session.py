@@ -55,6 +55,8 @@ FILES = {  # of a session, and whether every version writes it
     "transitions.parquet": False,
     "activity.parquet": False,
     "zones.parquet": False,
+    "interactions.parquet": False,
+    "interaction_totals.parquet": False,
     "columns.json": True,
     "session.rrd": True,
     "session.mcap": True,
@@ -217,6 +219,21 @@ class Session:
     activity = _table(
         "activity",
         "Table `activity`, one row per time bin: distance (mm) and share of each action.",
+    )
+
+    interactions = _table(
+        "interactions",
+        """Table `interactions`: who did what to whom, one row per event.
+
+    It lists those of all animals of the arena.
+
+    Only sessions of several animals in one arena have it.
+    """,
+    )
+
+    interaction_totals = _table(
+        "interaction_totals",
+        "Table `interaction_totals`, one row per ordered pair of animals and action: share, count.",
     )
 
     zone_visits = _table(

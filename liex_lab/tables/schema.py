@@ -143,6 +143,8 @@ SYNCED = {  # on the clock of another instrument, see `sessions.clock`; by table
     name: tuple(_column(line, {}) for line in _listed()[name] if line["when"] == "synced")
     for name in ("frames", "bouts")
 }
+# of sessions with several animals in one arena only
+INTERACTIONS = table_columns("interactions") + table_columns("interaction_totals")
 POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
@@ -154,7 +156,9 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    every = chain(*TABLES.values(), *SYNCED.values(), POINTS, branching, swimming, walking)
+    every = chain(
+        *TABLES.values(), *SYNCED.values(), INTERACTIONS, POINTS, branching, swimming, walking
+    )
     return {f"{c.table}.{c.name}": c for c in every}
 
 
@@ -418,7 +422,7 @@ _LATER = {
     "gaps": {"x_mm", "y_mm"},
 }
 _FEW = 10_000
-_SPANS = {"bouts", "gaps", "flips"}
+_SPANS = {"bouts", "gaps", "flips", "interactions"}
 # our types in Parquet, and their kinds in pandas
 _STORED = {"string": "BYTE_ARRAY", "float64": "DOUBLE", "int64": "INT64", "bool": "BOOLEAN"}
 _KINDS = {"string": "O", "float64": "f", "int64": "i", "bool": "b"}

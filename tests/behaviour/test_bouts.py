@@ -99,13 +99,14 @@ def test_short_pauses_are_bridged_before_short_bouts_are_dropped():
             np.zeros(40, np.int64),
             time,
             stop_times(time),
-            MouseRules(),
+            0.33,
+            0.23,
         )
     )
     assert bouts == [(0, 6), (20, 23)]
     taken = np.ones(40, bool)
     taken[2:4] = False  # another action holds the frames between
-    bouts = list(tidy(mask, taken, np.zeros(40, np.int64), time, stop_times(time), MouseRules()))
+    bouts = list(tidy(mask, taken, np.zeros(40, np.int64), time, stop_times(time), 0.33, 0.23))
     assert bouts == [(20, 23)]
 
 

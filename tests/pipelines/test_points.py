@@ -6,9 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from liex_lab.dashboards.figures.animals import joints_in_image, session_animals
-from liex_lab.pipelines.points import check_track, import_points, place_joints, track_of_points
+from liex_lab.pipelines.points import (
+    check_track,
+    import_animals,
+    import_points,
+    place_joints,
+    track_of_points,
+)
 
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
@@ -139,6 +146,57 @@ def test_a_refused_file_leaves_nothing(tmp_path):
     with pytest.raises(LiexError, match=r"5 of .* frames have points at both ends"):
         import_points(written(tmp_path, nothing), "mouse", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["m01.npz"]
+
+
+def several(folder: Path, second: np.ndarray) -> Path:
+    """Two animals in one table, a row per frame, animal and keypoint."""
+    rows = [
+        {"time": t, "individual": name, "keypoint": point, "x": x, "y": y, "z": z}
+        for name, joints in (("ada", TRUE), ("bob", second))
+        for t, frame in zip(MOUSE.times_s, joints, strict=True)
+        for point, (x, y, z) in zip(points().names, frame, strict=True)
+    ]
+    pd.DataFrame(rows).to_csv(folder / "pair.csv", index=False)
+    return folder / "pair.csv"
+
+
+def test_several_animals_of_a_file_become_sessions_with_their_interactions(tmp_path):
+    behind = TRUE.copy()  # bob follows ada by 0.5 s
+    behind[15:] = TRUE[:-15]
+    behind[:15] = np.nan
+    file = several(tmp_path, behind)
+    with pytest.raises(LiexError, match="holds the animals ada, bob; choose one"):
+        import_points(file, "mouse", tmp_path)
+    folders = import_animals(file, "mouse", tmp_path, report=False)
+    assert [one.name for one in folders] == ["pair-ada.liex", "pair-bob.liex"]
+    ada, bob = map(Session.open, folders)
+    assert [ada.metadata["individual"], bob.metadata["individual"]] == ["ada", "bob"]
+    assert bob.metadata["subject"]["subject_id"] == "pair-bob"
+    found = ada.interactions
+    pd.testing.assert_frame_equal(
+        found.drop(columns="session_id"), bob.interactions.drop(columns="session_id")
+    )
+    follows = found[found["action"] == "follow"]
+    assert set(follows["agent"]) == {"bob"}
+    assert follows["start_s"].min() >= 0.5  # before, bob is not observed
+    totals = ada.interaction_totals.set_index(["agent", "target", "action"])
+    assert totals.loc[("bob", "ada", "follow"), "total_s"] == pytest.approx(
+        follows["duration_s"].sum(), rel=0.02
+    )
+    described = set(ada.columns.loc[ada.columns["table"] == "interactions", "name"])
+    assert described == set(found.columns)
+    assert set(ada.metadata["interactions"]["definitions"]) >= set(found["action"])
+    (alone,) = import_animals(file, "mouse", tmp_path / "one", individual="ada", report=False)
+    assert alone.name == "pair.liex"
+    assert not Session.open(alone).has("interactions.parquet")
+    assert "interactions" not in set(Session.open(alone).columns["table"])
+
+
+def test_no_session_is_written_if_one_of_several_animals_cannot_be_used(tmp_path):
+    file = several(tmp_path, TRUE[:, ::-1])
+    with pytest.raises(LiexError, match="of the animal bob the animal moves tail first"):
+        import_animals(file, "mouse", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["pair.csv"]
 
 
 REAL = Path(__file__).parents[2].parent / "shared/data/mouse_actions_3d/adult_6112.npz"

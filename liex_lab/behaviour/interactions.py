@@ -1,0 +1,538 @@
+"""Who did what to whom: interactions of two to four animals of one arena, from their 3D joints.
+
+The words are `actions.vocabulary.INTERACTIONS`, their limits the plan's section `interactions`. A
+rule is the least of relative margins, 1 - d / D of a distance d within D and v / V - 1 of a speed v
+above V: an interaction reaches 0 and lasts until below -hysteresis, then pauses are bridged and
+short ones dropped, as for bouts. Distances between skins are those of two tubes around the
+mid-axes, as thick as the skeleton's body:
+
+    gap = min_ij |a_i - b_j| - r_i - r_j    (mm),  a_i, b_j: points along the two mid-axes.
+
+Frames in which either animal has no trusted pose are not observed: no interaction includes them,
+and shares are of the observed time of the pair. Sources: Live Mouse Tracker (de Chaumont et al.
+2019, Nature Biomedical Engineering 3:930) and deepof (Bordes et al. 2023, Nature Communications
+14:4319).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations, permutations
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from liex_lab.actions.vocabulary import INTERACTIONS as WORDS
+from liex_lab.behaviour.body import SWIMS, BodyAxis
+from liex_lab.behaviour.bouts import hysteresis, tidy
+from liex_lab.behaviour.kinematics import neighbours, segments
+from liex_lab.body.pose import Pose
+from liex_lab.body.shape import Surface
+from liex_lab.body.skeleton import Skeleton
+from liex_lab.plan.sections import InteractionThresholds
+from liex_lab.runtime.memory import blocks
+from liex_lab.tables.rows import frame_count, stop_times
+from liex_lab.tables.schema import INTERACTIONS, to_pandas
+from liex_lab.tracking.track import CORRECTED
+
+if TYPE_CHECKING:
+    from liex_lab.tracking.track import Track
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_ALONG = np.linspace(0.0, 1.0, 13)  # places along the body, from the front (0) to the rear (1)
+_TRUNK = _ALONG >= 0.25  # behind the head
+_REST = _ALONG >= 0.45  # what touches when animals rest together
+_NECK, _CHEST = 3, 4  # places of a quarter and a third of the body
+_WALKERS = ("mount", "huddle")  # words that swimming animals do not have
+_BLOCK = 4096
+_TABLES = ("interactions", "interaction_totals")
+
+
+@dataclass(frozen=True)
+class Individual:
+    """One animal of an arena in n frames.
+
+    Attributes:
+        name: its name in the column `individual`.
+        skeleton: a chain of J joints.
+        joints_mm: (n, J, 3) arena frame; NaN without a pose.
+        trusted: (n,) bool, whether the pose was measured and nothing contradicts it.
+    """
+
+    name: str
+    skeleton: Skeleton
+    joints_mm: Array
+    trusted: Mask
+
+    @staticmethod
+    def of_track(name: str, track: Track) -> Individual:
+        """The animal of a track."""
+        trusted = track.observed & np.isin(track.flag, ["", CORRECTED])
+        return Individual(name, track.skeleton, track.joints_mm, trusted)
+
+
+@dataclass(frozen=True)
+class Interactions:
+    """The interactions of an arena.
+
+    Attributes:
+        events: the table `interactions` without session_id.
+        totals: the table `interaction_totals` without session_id.
+        limits: the thresholds.
+        names: of the animals.
+    """
+
+    events: pd.DataFrame
+    totals: pd.DataFrame
+    limits: InteractionThresholds
+    names: tuple[str, ...]
+
+    def for_session(self, session_id: str) -> dict[str, Any]:
+        """Tables, descriptions of their columns and notes, as `SessionWriter.close` takes them."""
+        tables = zip(_TABLES, (self.events, self.totals), strict=True)
+        about = {
+            "individuals": list(self.names),
+            "limits": self.limits.model_dump(),
+            "definitions": definitions(self.limits),
+        }
+        return {
+            "results": {
+                name: to_pandas(
+                    [column for column in INTERACTIONS if column.table == name],
+                    {"session_id": session_id, **table},
+                )
+                for name, table in tables
+            },
+            "columns": INTERACTIONS,
+            "record": {"interactions": about},
+        }
+
+
+def definitions(limits: InteractionThresholds) -> dict[str, str]:
+    """The definition of each word with these thresholds, as sentences."""
+    return {word: one.meaning.format(**limits.model_dump()) for word, one in WORDS.items()}
+
+
+def find_interactions(
+    time_s: Array,
+    animals: Sequence[Individual],
+    limits: InteractionThresholds | None = None,
+    frame_index: NDArray[np.int64] | None = None,
+) -> Interactions:
+    """The interactions of the animals of one arena.
+
+    Args:
+        time_s: (n,) times of the frames, s since the first, increasing.
+        animals: two or more, each with n frames.
+        limits: the thresholds; None uses the defaults.
+        frame_index: (n,) index of each frame in the recording; None counts from 0.
+    """
+    limits = limits or InteractionThresholds()
+    arena = _Arena(time_s, [_Course.of(one, time_s, limits) for one in animals], limits)
+    found = sorted(arena.events(), key=lambda event: (event.start, event.stop, event.word))
+    start, stop = np.array([(one.start, one.stop) for one in found], np.int64).reshape(-1, 2).T
+    count = frame_count(np.arange(len(time_s)) if frame_index is None else frame_index)
+    names = [one.name for one in animals]
+    events = pd.DataFrame(
+        {
+            "agent": [names[one.agent] for one in found],
+            "target": [names[one.target] if one.target >= 0 else "" for one in found],
+            "action": [one.word for one in found],
+            "start_s": time_s[start],
+            "stop_s": arena.stop_s[stop - 1],
+            "duration_s": arena.stop_s[stop - 1] - time_s[start],
+            "start_frame": count[start],
+            "stop_frame": count[stop],
+            "score": np.array([one.score for one in found], float),
+            "directed": np.array([one.directed for one in found], bool),
+        }
+    )
+    return Interactions(events, _totals(arena, found, names), limits, tuple(names))
+
+
+class _Event(NamedTuple):
+    """An interaction in the rows [start, stop); the target of `isolated` is -1."""
+
+    agent: int
+    target: int
+    word: str
+    start: int
+    stop: int
+    score: float
+    directed: bool
+
+
+class _Course(NamedTuple):
+    """Body and motion of one animal in n frames, NaN where it has no trusted pose.
+
+    Heading and velocity of an animal that stands are level.
+    """
+
+    along: Array  # (n, M, 3) mm, points of the mid-axis at `_ALONG`
+    radius: Array  # (M,) mm, of the body there
+    heading: Array  # (n, 3) unit vectors
+    centre: Array  # (n, 3) mm
+    velocity: Array  # (n, 3) mm/s
+    swims: bool
+
+    @property
+    def speed(self) -> Array:
+        return np.asarray(np.linalg.norm(self.velocity, axis=1))
+
+    @staticmethod
+    def of(animal: Individual, time_s: Array, limits: InteractionThresholds) -> _Course:
+        skeleton = animal.skeleton
+        body = BodyAxis.of(skeleton.names, skeleton.parents.tolist())
+        flat = np.array([1.0, 1.0, float(body.kind == SWIMS)])
+        joints = np.where(animal.trusted[:, None, None], animal.joints_mm, np.nan)
+        spine = joints[:, body.spine]
+        length = np.linalg.norm(np.diff(spine, axis=1), axis=2).sum(axis=1)
+        known = np.isfinite(length)
+        scale = float(np.median(length[known])) / skeleton.length if known.any() else 1.0
+        share = np.abs(skeleton.reach[list(body.spine)] - skeleton.reach[body.front])
+        share /= skeleton.length
+        weight = np.stack([np.interp(_ALONG, share, unit) for unit in np.eye(len(share))], axis=1)
+        centre = joints[:, body.trunk].mean(axis=1) * flat
+        before, after = neighbours(time_s, known, limits.speed_half_window_s)
+        since = np.where(after > before, time_s[after] - time_s[before], np.nan)
+        ahead = (joints[:, body.axis[1]] - joints[:, body.axis[0]]) * flat
+        return _Course(
+            np.einsum("ms,nsd->nmd", weight, spine),
+            scale * _radii(skeleton, body),
+            ahead / np.linalg.norm(ahead, axis=1, keepdims=True),
+            centre,
+            (centre[after] - centre[before]) / since[:, None],
+            body.kind == SWIMS,
+        )
+
+
+def _radii(skeleton: Skeleton, body: BodyAxis) -> Array:
+    """Radius (M,) mm of the body at scale 1 at the places `_ALONG`: of the nearest skin, the
+    median distance from the mid-axis.
+    """
+    home, surface = Pose.home(skeleton), Surface.of(skeleton)
+    skin = surface.vertices(home)[: surface.n_trunk_vertices]
+    ends = home.joints(skeleton)[[body.front, body.rear]]
+    axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    along = (skin - ends[0]) @ axis
+    across = np.linalg.norm(skin - ends[0] - along[:, None] * axis, axis=1)
+    place = np.abs(along[:, None] / skeleton.length - _ALONG).argmin(axis=1)
+    radius = [np.median(across[place == k]) if (place == k).any() else np.nan for k in range(13)]
+    there = np.isfinite(radius)
+    return np.asarray(np.interp(_ALONG, _ALONG[there], np.array(radius)[there]))
+
+
+class _Toward(NamedTuple):
+    """Where one animal, the agent, is in relation to another, the target, in n frames."""
+
+    gap: Array  # mm, of the skins
+    trunks: Array  # mm, of the skins of the rear halves
+    part: Array  # the place of the target that is nearest to the agent's nose, see `_ALONG`
+    nose_skin: Array  # mm, of the agent's nose from the skin of the target's trunk
+    noses: Array  # mm
+    tails: Array  # mm, of the tail bases
+    nose_tail: Array  # mm, of the agent's nose from the target's tail base
+    above: Array  # margin by which the agent's chest is above the target's trunk
+    angle: Array  # rad, of the headings
+    at_nose: Array  # rad, of the agent's head and the direction of the target's nose
+    at_tail: Array  # rad, of the agent's head and the direction of the target's tail base
+    closing: Array  # mm/s, of the agent towards the target
+
+    @staticmethod
+    def of(a: _Course, b: _Course, limits: InteractionThresholds) -> _Toward:
+        n = len(a.centre)
+        gap, trunks, place, skin, above = np.empty((5, n))
+        for part in blocks(n, _BLOCK):
+            off = a.along[part, :, None] - b.along[part, None]
+            apart = np.linalg.norm(off, axis=-1) - a.radius[:, None] - b.radius
+            gap[part] = apart.min(axis=(1, 2))
+            trunks[part] = apart[:, _REST][:, :, _REST].min(axis=(1, 2))
+            place[part] = _ALONG[apart[:, 0].argmin(axis=1)]
+            skin[part] = apart[:, 0, _TRUNK].min(axis=1) + a.radius[0]
+            chest = off[:, _CHEST, _TRUNK]
+            within = 1.0 - np.linalg.norm(chest[..., :2], axis=-1) / b.radius[_TRUNK]
+            higher = chest[..., 2] / limits.mount_above_mm - 1.0
+            above[part] = np.minimum(within, higher).max(axis=1)
+        way = b.centre - a.centre
+        way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+        ends = [one.along[:, k] for one in (a, b) for k in (0, -1)]
+        neck = a.along[:, _NECK]
+        return _Toward(
+            gap,
+            trunks,
+            place,
+            skin,
+            np.linalg.norm(ends[0] - ends[2], axis=1),
+            np.linalg.norm(ends[1] - ends[3], axis=1),
+            np.linalg.norm(ends[0] - ends[3], axis=1),
+            above,
+            _angle(a.heading, b.heading),
+            _angle(ends[0] - neck, ends[2] - neck),
+            _angle(ends[0] - neck, ends[3] - neck),
+            np.einsum("nd,nd->n", a.velocity, way),
+        )
+
+
+def _angle(a: Array, b: Array) -> Array:
+    """Angle (n,) between vectors (n, 3), rad."""
+    across = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.asarray(np.arctan2(across, np.einsum("nd,nd->n", a, b)))
+
+
+def _within(distance: Array, most: float) -> Array:
+    return 1.0 - distance / most
+
+
+def _where(mask: Mask) -> Array:
+    return np.where(mask, np.inf, -np.inf)
+
+
+def _over(value: Array, least: float) -> Array:
+    return value / least - 1.0
+
+
+class _Arena:
+    """The animals of one arena and their interactions.
+
+    Args:
+        time_s: (n,) s.
+        animals: their courses.
+        limits: the thresholds.
+    """
+
+    def __init__(
+        self, time_s: Array, animals: Sequence[_Course], limits: InteractionThresholds
+    ) -> None:
+        self.time_s, self.animals, self.limits = time_s, animals, limits
+        self.stop_s = stop_times(time_s)
+        self.known = np.stack([np.isfinite(one.centre[:, 0]) for one in animals])
+
+    @cached_property
+    def relations(self) -> dict[tuple[int, int], _Toward]:
+        """Each animal in relation to each other one."""
+        return {
+            (i, j): _Toward.of(self.animals[i], self.animals[j], self.limits)
+            for i, j in permutations(range(len(self.animals)), 2)
+        }
+
+    def observed(self, *animals: int) -> Mask:
+        """(n,) bool, the frames in which these animals, or all, have a trusted pose."""
+        return np.asarray(self.known[list(animals) or slice(None)].all(axis=0))
+
+    def events(self) -> Iterator[_Event]:
+        """Every interaction; pair by pair, not in order of time."""
+        for i, j in combinations(range(len(self.animals)), 2):
+            yield from self._of_pair(i, j)
+        seen = self.observed()
+        number = segments(self.time_s, seen)
+        for i in range(len(self.animals)):
+            nearest = np.min([one.gap for (a, _), one in self.relations.items() if a == i], axis=0)
+            margin = _over(nearest, self.limits.isolated_mm)
+            for start, stop, score in self._spans("isolated", margin, seen, number):
+                yield _Event(i, -1, "isolated", start, stop, score, True)
+
+    def _spans(
+        self, word: str, margin: Array, free: Mask, number: NDArray[np.int64]
+    ) -> list[tuple[int, int, float]]:
+        """Rows [start, stop) and score of each interaction with a margin (n,) in free frames."""
+        limits = self.limits
+        least = {"huddle": limits.huddle_s, "isolated": limits.isolated_s}.get(word, limits.min_s)
+        mask = hysteresis(margin, 0.0, -limits.hysteresis, number) & free
+        spans = tidy(mask, free, number, self.time_s, self.stop_s, limits.merge_s, least)
+        return [(a, b, float((margin[a:b] >= 0.0).mean())) for a, b in spans]
+
+    def _of_pair(self, i: int, j: int) -> Iterator[_Event]:
+        """The interactions of two animals."""
+        seen = self.observed(i, j)
+        number = segments(self.time_s, seen)
+        ways = ((i, j), (j, i))
+        margins = {way: self._margins(*way, number) for way in ways}
+        free = {way: seen.copy() for way in ways}
+        done = {word: np.zeros(len(seen), np.bool_) for word in WORDS}  # by either animal
+        for word in (word for word in WORDS if word in margins[ways[0]]):
+            rule = WORDS[word]
+            without = np.any([done[one] for one in rule.not_in], axis=0)
+            for way in ways[:1] if rule.mutual else ways:
+                taken = ways if rule.mutual else (way,)
+                room = np.all([free[one] for one in taken], axis=0)
+                room = seen & ~without if rule.layered else room
+                for start, stop, score in self._spans(word, margins[way][word], room, number):
+                    rows = slice(start, stop)
+                    done[word][rows] = True
+                    if not rule.layered:
+                        for one in taken:
+                            free[one][rows] = False
+                    if rule.mutual:
+                        yield self._came(i, j, word, start, stop, score, number)
+                    elif word in ("approach", "leave"):
+                        yield from self._crossing(way, word, start, stop, score, number)
+                    else:
+                        pace = np.median(self.animals[way[0]].speed[rows])
+                        fast = word == "follow" and pace > self.limits.fast_mm_s
+                        yield _Event(*way, "chase" if fast else word, start, stop, score, True)
+
+    def _margins(self, i: int, j: int, number: NDArray[np.int64]) -> dict[str, Array]:
+        """Margin (n,) of each rule of animal i towards j; those of mutual words are alike."""
+        a, b, limits = self.animals[i], self.animals[j], self.limits
+        to, back = self.relations[i, j], self.relations[j, i]
+        nearest, angle = self._trail(i, j, number)
+        still = [_within(one.speed, limits.still_mm_s) for one in (a, b)]
+        moving = [_over(one.speed, limits.moving_mm_s) for one in (a, b)]
+        goes, comes = to.closing, back.closing
+        straight = np.abs(goes) >= np.sqrt(0.5) * a.speed
+        rules: dict[str, Sequence[Array]] = {
+            "mount": (to.above, _within(to.angle, limits.mount_angle_rad)),
+            "huddle": (_within(to.trunks, limits.contact_mm), *still),
+            "follow": (
+                _within(nearest, limits.follow_mm),
+                _within(angle, limits.follow_angle_rad),
+                *moving,
+            ),
+            "nose_to_nose": (
+                _within(to.noses, limits.nose_mm),
+                _within(np.minimum(to.at_nose, back.at_nose), limits.nose_angle_rad),
+                _where(np.maximum(to.part, back.part) < 0.25),
+            ),
+            "nose_to_tail_base": (
+                _within(to.nose_tail, limits.nose_mm),
+                _within(to.at_tail, limits.nose_angle_rad),
+                _where(to.part > 0.75),
+            ),
+            "side_by_side_same": (
+                _within(to.noses, limits.side_by_side_mm),
+                _within(to.tails, limits.side_by_side_mm),
+            ),
+            "side_by_side_opposite": (
+                _within(to.nose_tail, limits.side_by_side_mm),
+                _within(back.nose_tail, limits.side_by_side_mm),
+            ),
+            "nose_to_side": (
+                _within(to.nose_skin, limits.contact_mm),
+                _where((to.part >= 0.25) & (to.part <= 0.75)),
+            ),
+            "contact": (_within(to.gap, limits.contact_mm),),
+            "approach": (
+                _over(goes, limits.moving_mm_s),
+                _over(goes + comes, limits.moving_mm_s),
+                _where((goes > comes) & straight),
+            ),
+            "leave": (
+                _over(-goes, limits.moving_mm_s),
+                _over(-goes - comes, limits.moving_mm_s),
+                _where((goes < comes) & straight),
+            ),
+            "avoid": (
+                _over(-goes, limits.moving_mm_s),
+                _over(comes, limits.moving_mm_s),
+                _within(to.gap, limits.avoid_mm),
+                _where(to.gap > limits.near_mm),
+            ),
+        }
+        without = _WALKERS if a.swims else ()
+        return {word: np.min(rules[word], axis=0) for word in rules if word not in without}
+
+    def _trail(self, i: int, j: int, number: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Of the places of j's tail base within `follow_s`, the nearest to i's nose: its distance
+        (n,) mm, and the angle (n,) rad between i's heading and j's when it was there.
+        """
+        a, b, n = self.animals[i], self.animals[j], len(number)
+        nearest, angle = np.full((2, n), np.inf)
+        for back in range(n):
+            now, then = slice(back, n), slice(0, n - back)
+            recent = self.time_s[now] - self.time_s[then] <= self.limits.follow_s
+            if not recent.any():
+                break
+            away = np.linalg.norm(a.along[now, 0] - b.along[then, -1], axis=1)
+            better = recent & (number[now] == number[then]) & (away < nearest[now])
+            nearest[now][better] = away[better]
+            angle[now][better] = _angle(a.heading[now], b.heading[then])[better]
+        return nearest, angle
+
+    def _crossing(
+        self,
+        way: tuple[int, int],
+        word: str,
+        start: int,
+        stop: int,
+        score: float,
+        number: NDArray[np.int64],
+    ) -> Iterator[_Event]:
+        """An approach that ends near the target, or leaving that begins there; else nothing.
+
+        The animal slows down at the near end, so that half a window beyond it is also searched.
+        """
+        limits, time_s = self.limits, self.time_s
+        gap = self.relations[way].gap
+        last = np.searchsorted(time_s, self.stop_s[stop - 1] + limits.speed_half_window_s)
+        first = np.searchsorted(time_s, time_s[start] - limits.speed_half_window_s)
+        rows = np.arange(start, last) if word == "approach" else np.arange(first, stop)[::-1]
+        rows = rows[number[rows] == number[start]]
+        near = gap[rows] <= limits.near_mm
+        if near[0] or not near.any():
+            return
+        rows = np.sort(rows[: max(int(near.argmax()) + 1, stop - start)])
+        speed = self.animals[way[0]].speed[rows]
+        fast = word == "leave" and np.nanmax(speed) > limits.fast_mm_s
+        start, stop = int(rows[0]), int(rows[-1]) + 1
+        yield _Event(*way, "escape" if fast else word, start, stop, score, True)
+
+    def _came(
+        self,
+        i: int,
+        j: int,
+        word: str,
+        start: int,
+        stop: int,
+        score: float,
+        number: NDArray[np.int64],
+    ) -> _Event:
+        """A mutual contact; its agent is the animal that came nearer by more before it."""
+        first = np.searchsorted(self.time_s, self.time_s[start] - self.limits.before_s)
+        rows = np.arange(first, start + 1)
+        rows = rows[number[rows] == number[start]]
+        hold = self.stop_s[rows] - self.time_s[rows]
+        came = [
+            float(np.nansum(np.maximum(self.relations[way].closing[rows], 0.0) * hold))
+            for way in ((i, j), (j, i))
+        ]
+        pair = (i, j) if came[0] >= came[1] else (j, i)
+        directed = max(came) >= max(2.0 * min(came), self.limits.contact_mm)
+        return _Event(*pair, word, start, stop, score, directed)
+
+
+def _totals(arena: _Arena, found: Sequence[_Event], names: Sequence[str]) -> pd.DataFrame:
+    """The table `interaction_totals`: every word for every ordered pair."""
+    hold = arena.stop_s - arena.time_s
+    swims = arena.animals[0].swims
+    rows = []
+    pairs = [*permutations(range(len(names)), 2), *((i, -1) for i in range(len(names)))]
+    for agent, target in pairs:
+        seen = arena.observed() if target < 0 else arena.observed(agent, target)
+        observed_s = float(hold[seen].sum())
+        first_s = float(arena.time_s[seen][0]) if seen.any() else np.nan
+        for word, one in WORDS.items():
+            if (word == "isolated") != (target < 0) or (swims and word in _WALKERS):
+                continue
+            either = ((agent, target), (target, agent)) if one.mutual else ((agent, target),)
+            own = [event for event in found if event.word == word and event[:2] in either]
+            total_s = float(sum(hold[event.start : event.stop].sum() for event in own))
+            rows.append(
+                {
+                    "agent": names[agent],
+                    "target": names[target] if target >= 0 else "",
+                    "action": word,
+                    "count": len(own),
+                    "total_s": total_s,
+                    "share": total_s / observed_s if observed_s else np.nan,
+                    "per_min": 60.0 * len(own) / observed_s if observed_s else np.nan,
+                    "latency_s": arena.time_s[own[0].start] - first_s if own else np.nan,
+                    "observed_s": observed_s,
+                }
+            )
+    return pd.DataFrame(rows)

@@ -1,0 +1,413 @@
+"""Groups of mice that interact, with the truth of who did what to whom: `synthetic:pair`.
+
+A group plays encounters in turn: one animal walks up to another, does one of `ENCOUNTERS`, and one
+of the two leaves. Each animal steers towards goals in the floor, around the others; its body and
+postures are those of `stage.draw_mouse`. Truth are the intentions of the script (`Act`), not
+distances: thresholds of the rules that are to be scored play no part.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.geometry import SE3, so3
+from liex_lab.simulation.locomotion import smoothed
+from liex_lab.simulation.recording import Actor, RenderedRecording
+from liex_lab.simulation.rendering import Solid
+from liex_lab.simulation.scene import SimulatedScene
+from liex_lab.simulation.scenes.catalogue import RECIPES, Making
+from liex_lab.simulation.scenes.places import Mesh
+from liex_lab.simulation.scenes.stage import draw_mouse, free_spot, timing_of
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
+from liex_lab.simulation.species import MouseSpecies
+
+Array = NDArray[np.float64]
+
+_HZ = 30.0
+_TURN = 6.0 / _HZ  # rad per frame, the fastest turn
+_HUNCH = 3  # of `pose_prior.KINDS`, the posture of animals that rest
+_AHEAD, _BEHIND = 0.5, 0.45  # from the body's centre to the nose and to the tail base, spines
+_ROOM_MM = 110.0  # between the centres of animals that pass each other
+_WIDE_MM = 36.0  # of two bodies side by side, between their mid-axes, for spines of 65 mm
+ENCOUNTERS: Final = (
+    "follow",
+    "chase",
+    "cross",
+    "nose_to_nose",
+    "nose_to_tail_base",
+    "nose_to_side",
+    "side_by_side_same",
+    "side_by_side_opposite",
+    "mount",
+    "huddle",
+    "avoid",
+    "escape",
+    "apart",
+)
+
+
+class Act(NamedTuple):
+    """What one animal did to another, by numbers, in the frames [start, stop)."""
+
+    agent: int
+    target: int
+    action: str
+    start: int
+    stop: int
+
+
+class Group:
+    """The paths of a group and its acts, frame by frame.
+
+    Args:
+        rng: random number generator.
+        arena: the arena.
+        spines: length of each animal, mm.
+    """
+
+    def __init__(
+        self, rng: np.random.Generator, arena: SimulatedScene, spines: Sequence[float]
+    ) -> None:
+        self.rng, self.arena, self.spine = rng, arena, np.array(spines)
+        self.acts: list[Act] = []
+        self.rows: list[Array] = []  # of each frame (A, 5): x, y, heading, resting, mounting
+        self.at = np.zeros((len(spines), 2))
+        for i in range(len(spines)):
+            self.at[i] = self._spot(i)
+        self.way = rng.uniform(-np.pi, np.pi, len(spines))
+        self.resting, self.mounting = np.zeros((2, len(spines)))
+
+    def _spot(self, who: int, apart_mm: float = 130.0) -> Array:
+        """A free place away from all other animals."""
+        others = np.arange(len(self.at)) != who
+        spots = [free_spot(self.rng, self.arena, 0.8 * float(self.spine[who])) for _ in range(12)]
+        room = [np.linalg.norm(self.at[others] - spot, axis=1).min() for spot in spots]
+        return (
+            spots[int(np.argmax(np.array(room) > apart_mm))]
+            if max(room) > apart_mm
+            else (spots[int(np.argmax(room))])
+        )
+
+    def ahead(self, who: int) -> Array:
+        """Unit vector of an animal's heading."""
+        return np.array([np.cos(self.way[who]), np.sin(self.way[who])])
+
+    def frame(self) -> None:
+        """Keep the present frame."""
+        state = (self.at, self.way, self.resting, self.mounting)
+        self.rows.append(np.column_stack(state))
+
+    def step(self, who: int, goal: Array, mm_s: float, shy: Sequence[int] = ()) -> float:
+        """Walk one frame towards a goal, around the animals of `shy`; returns the distance left."""
+        gap = goal - self.at[who]
+        left = float(np.linalg.norm(gap))
+        ahead = float(np.arctan2(gap[1], gap[0]))
+        for other in shy:
+            toward = self.at[other] - self.at[who]
+            far = float(np.linalg.norm(toward))
+            off = (ahead - np.arctan2(toward[1], toward[0]) + np.pi) % (2 * np.pi) - np.pi
+            clear = np.arcsin(min(1.0, _ROOM_MM / max(far, 1.0)))
+            clear += max(0.0, 1.0 - far / _ROOM_MM)  # outwards, if it is too near
+            if far < left + 40.0 and abs(off) < clear:
+                ahead += (np.sign(off) or 1.0) * (clear - abs(off))
+        turn = (ahead - self.way[who] + np.pi) % (2 * np.pi) - np.pi
+        self.way[who] += np.clip(turn, -_TURN, _TURN)
+        run = min(mm_s, 8.0 * left + 20.0) * max(float(np.cos(turn)), 0.1) / _HZ
+        self.at[who] += min(run, left) * self.ahead(who)
+        return left
+
+    def walk(
+        self,
+        who: int,
+        goal: Callable[[], Array],
+        mm_s: float,
+        shy: Sequence[int] = (),
+        near_mm: float = 6.0,
+    ) -> None:
+        """Walk to a goal, at most 6 s."""
+        for _ in range(180):
+            left = self.step(who, goal(), mm_s, shy)
+            self.frame()
+            if left < near_mm:
+                return
+
+    def face(self, who: int, way: float) -> None:
+        """Turn in place."""
+        for _ in range(40):
+            turn = (way - self.way[who] + np.pi) % (2 * np.pi) - np.pi
+            if abs(turn) < 0.03:
+                return
+            self.way[who] += np.clip(turn, -_TURN, _TURN)
+            self.frame()
+
+    def wait(self, seconds: float) -> None:
+        """Stand."""
+        for _ in range(int(seconds * _HZ)):
+            self.frame()
+
+    def act(self, agent: int, target: int, action: str, start: int) -> None:
+        """Note an act that began at a frame and ends now."""
+        self.acts.append(Act(agent, target, action, start, len(self.rows)))
+
+
+def _meet(group: Group, agent: int, target: int, place: Array, turn: float) -> int:
+    """Approach an animal that stands in the middle: go straight to a place (forward, left; mm) in
+    its frame, then stand at an angle `turn` to it; returns the frame of arrival.
+    """
+    others = [k for k in range(len(group.at)) if k != agent]
+    middle = group.arena.centre + group.rng.uniform(-25.0, 25.0, 2)
+    for k in range(len(group.at)):
+        if k != target and np.linalg.norm(group.at[k] - middle) < 150.0:
+            spot = group._spot(k, 150.0)
+            group.walk(k, lambda spot=spot: spot, 200.0, [one for one in others if one != k])
+    group.walk(target, lambda: middle, 150.0, [k for k in range(len(group.at)) if k != target])
+    ahead = group.ahead(target)
+    goal = group.at[target] + place[0] * ahead + place[1] * np.array([-ahead[1], ahead[0]])
+    out = (goal - middle) / np.linalg.norm(goal - middle)
+    start = goal + float(group.rng.uniform(90.0, 120.0)) * out
+    group.walk(agent, lambda: start, 180.0, others, near_mm=15.0)
+    group.face(agent, float(np.arctan2(-out[1], -out[0])))
+    group.wait(0.2)
+    begun, mm_s = len(group.rows), float(group.rng.uniform(110.0, 220.0))
+    group.walk(agent, lambda: goal, mm_s)
+    group.act(agent, target, "approach", begun)
+    arrived = len(group.rows)
+    group.face(agent, group.way[target] + turn)
+    return arrived
+
+
+def _leave(group: Group, agent: int, target: int, fast: bool = False) -> None:
+    """Go straight away from another animal; it runs if `fast`."""
+    away = group.at[agent] - group.at[target]
+    way = float(np.arctan2(away[1], away[0])) + group.rng.uniform(-0.5, 0.5)
+    far = float(group.rng.uniform(*((150.0, 180.0) if fast else (110.0, 150.0))))
+    goal = group.at[agent] + far * np.array([np.cos(way), np.sin(way)])
+    if not fast:
+        group.face(agent, way)
+    begun = len(group.rows)
+    mm_s = float(group.rng.uniform(450.0, 550.0) if fast else group.rng.uniform(110.0, 220.0))
+    group.walk(agent, lambda: goal, mm_s, near_mm=10.0)
+    group.act(agent, target, "escape" if fast else "leave", begun)
+
+
+def _play(group: Group, agent: int, target: int, action: str) -> None:
+    """One encounter from meeting to leaving; an animal apart only walks."""
+    rng, spines = group.rng, group.spine
+    wide = _WIDE_MM * float(spines[[agent, target]].mean()) / 65.0
+    side = float(rng.choice([-1.0, 1.0]))
+    nose, other = _AHEAD * spines[agent], spines[target]
+    seconds = float(rng.uniform(1.0, 2.5))
+    if action in ("apart", "cross"):
+        goals = [group._spot(k, 220.0) for k in (agent, target)]
+        shy = ([target], [agent])
+        if action == "cross":  # each to where the other was, past it on one side
+            way = group.at[target] - group.at[agent]
+            aside = np.array([-way[1], way[0]]) / np.linalg.norm(way) * rng.uniform(22.0, 40.0)
+            goals, shy = [group.at[target] + aside, group.at[agent] - aside], ([], [])
+        for _ in range(int(3.0 * _HZ)):
+            for k, who in enumerate((agent, target)):
+                if np.linalg.norm(goals[k] - group.at[who]) > 12.0:
+                    group.step(who, goals[k], 170.0, shy[k])
+            group.frame()
+        return
+    if action in ("follow", "chase"):
+        _pursue(group, agent, target, action == "chase")
+        return
+    if action == "avoid":
+        _shun(group, agent, target)
+        return
+    # places (forward, left) of the agent's centre in the target's frame, and its angle there
+    gap = float(rng.uniform(6.0, 13.0))
+    places = {
+        "nose_to_nose": ((_AHEAD * other + gap + nose, 0.0), np.pi),
+        "nose_to_tail_base": ((-_BEHIND * other - gap - nose, 0.0), 0.0),
+        "nose_to_side": ((0.0, side * (0.4 * wide + 3.0 + nose)), -side * np.pi / 2),
+        "escape": ((0.0, side * (0.4 * wide + 3.0 + nose)), -side * np.pi / 2),
+        "side_by_side_same": ((0.0, side * (wide + 3.0)), 0.0),
+        "side_by_side_opposite": ((0.0, side * (wide + 3.0)), np.pi),
+        "huddle": ((0.0, side * 0.82 * wide), 0.0),
+        "mount": ((-_BEHIND * other - 6.0 - nose, 0.0), 0.0),
+    }
+    place, turn = places[action]
+    arrived = _meet(group, agent, target, np.array(place), turn)
+    begun = arrived if action.startswith("nose") else len(group.rows)
+    if action == "huddle":
+        group.resting[[agent, target]] = 1.0
+        seconds = float(rng.uniform(5.0, 9.0))
+    if action == "mount":
+        group.wait(0.5)
+        group.act(agent, target, "nose_to_tail_base", begun)
+        ride = group.at[target] + (0.45 * spines[agent] - 0.45 * other - 8.0) * group.ahead(target)
+        group.walk(agent, lambda: ride, 120.0)
+        begun = len(group.rows)
+        group.mounting[agent] = 1.0
+    group.wait(seconds)
+    group.mounting[agent] = 0.0
+    group.resting[[agent, target]] = 0.0
+    group.act(agent, target, "nose_to_side" if action == "escape" else action, begun)
+    if action == "huddle":  # they rest side by side
+        group.act(agent, target, "side_by_side_same", begun)
+    if action == "mount":
+        group.wait(0.3)
+    leaver = target if action == "escape" or rng.random() < 0.3 else agent
+    if action == "mount":
+        leaver = target
+    _leave(group, leaver, agent + target - leaver, action == "escape")
+
+
+def _pursue(group: Group, agent: int, target: int, fast: bool) -> None:
+    """Follow or chase: the agent goes along the target's path, about a body length behind."""
+    rng, behind = group.rng, 0.5 * float(group.spine[[agent, target]].sum())
+    behind += float(rng.uniform(8.0, 30.0))
+    place = np.array([-behind, 0.0])
+    _meet(group, agent, target, place, 0.0)
+    trail = [group.at[agent].copy()]
+    trail += [group.at[agent] + s * (group.at[target] - group.at[agent]) for s in (0.33, 0.67, 1.0)]
+    pace = float(rng.uniform(380.0, 450.0) if fast else rng.uniform(120.0, 230.0))
+    begun, round_mm = len(group.rows), float(rng.choice([-1.0, 1.0]) * rng.uniform(70.0, 90.0))
+    for i in range(int(rng.uniform(1.6, 2.6) * _HZ)):
+        run = pace / _HZ * min(1.0, (i + 1) / 8.0)
+        group.way[target] += run / round_mm
+        group.at[target] += run * group.ahead(target)
+        trail.append(group.at[target].copy())
+        steps = np.linalg.norm(np.diff(trail, axis=0), axis=1)
+        back = np.concatenate([np.cumsum(steps[::-1])[::-1], [0.0]])  # mm behind the target
+        here = np.array([np.interp(-behind, -back, axis) for axis in np.array(trail).T])
+        then = np.array([np.interp(4.0 - behind, -back, axis) for axis in np.array(trail).T])
+        group.at[agent], way = here, then - here
+        if np.linalg.norm(way) > 0.1:
+            turn = (np.arctan2(way[1], way[0]) - group.way[agent] + np.pi) % (2 * np.pi) - np.pi
+            group.way[agent] += np.clip(turn, -_TURN, _TURN)
+        group.frame()
+    group.act(agent, target, "chase" if fast else "follow", begun)
+    _leave(group, agent, target)
+
+
+def _shun(group: Group, agent: int, target: int) -> None:
+    """Avoid: the target approaches and stops, the agent goes away before it is touched."""
+    rng = group.rng
+    near = float(rng.uniform(180.0, 210.0))  # between the centres
+    for _ in range(180):
+        group.step(target, group.at[agent], 170.0)
+        group.frame()
+        if np.linalg.norm(group.at[agent] - group.at[target]) < near:
+            break
+    away = group.at[agent] - group.at[target]
+    goal = group.at[agent] + 160.0 * away / np.linalg.norm(away)
+    if group.arena.freedom(goal) < 40.0:
+        goal = group._spot(agent, 200.0)
+    begun = 0
+    for i in range(int(1.3 * _HZ)):
+        turn = np.arctan2(*(goal - group.at[agent])[::-1]) - group.way[agent]
+        if i < 15:  # it turns away
+            group.way[agent] += np.clip((turn + np.pi) % (2 * np.pi) - np.pi, -_TURN, _TURN)
+        else:
+            begun = begun or len(group.rows)
+            group.step(agent, goal, 210.0, [target])
+        group.step(target, group.at[agent].copy(), 110.0)
+        group.frame()
+    group.act(agent, target, "avoid", begun)
+    group.walk(agent, lambda: goal, 200.0, [target], near_mm=15.0)
+
+
+@dataclass(frozen=True)
+class GroupMaking(Making):
+    """Builds one recording of a group.
+
+    Attributes:
+        encounters: the acts that are played in turn, of `ENCOUNTERS`.
+        apart: difference in length between one animal and the next, share.
+    """
+
+    encounters: Sequence[str] = ENCOUNTERS
+    apart: float = 0.0
+
+    def group(self, arena: SimulatedScene) -> Group:
+        """The paths of the group in at least `n_frames` frames."""
+        rng = np.random.default_rng([self.seed, 78])
+        base = self.spine_mm or float(rng.uniform(60.0, 74.0))
+        n = self.recipe.n_animals
+        group = Group(rng, arena, base * (1.0 + self.apart) ** -np.arange(n))
+        while len(group.rows) < self.n_frames:
+            for action in rng.permutation(self.encounters):
+                agent, target = rng.permutation(n)[:2]
+                group.wait(float(rng.uniform(0.5, 1.0)))
+                _play(group, int(agent), int(target), str(action))
+        return group
+
+    def _cast(
+        self, species: MouseSpecies, arenas: list[SimulatedScene]
+    ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
+        """The animals of the group, and nothing else."""
+        group = self.group(arenas[0])
+        n = self.n_frames
+        rows = np.stack(group.rows)[:n]
+        timing = timing_of("always", n)
+        animals = []
+        for which, spine in enumerate(group.spine):
+            path = rows[:, which]
+            place = smoothed(path[:, :2], 2.0)
+            heading = smoothed(np.unwrap(path[:, 2]), 2.0)
+            speed = np.linalg.norm(np.gradient(place, axis=0), axis=1) * _HZ / spine
+            kinds = np.where(path[:, 3] > 0, _HUNCH, 0)
+            animal = draw_mouse(
+                self.seed,
+                which,
+                species,
+                arenas[0],
+                self.family,
+                float(spine),
+                timing,
+                lambda rng, m, kinds=kinds, speed=speed: (kinds, speed),
+                lambda rng, scene, mm, pace, place=place, heading=heading: (place, heading),
+            )
+            animals.append(_risen(animal, smoothed(path[:, 4], 4.0)))
+        return animals, [], []
+
+
+def _risen(animal: Actor, share: Array) -> Actor:
+    """The animal, its front raised about its tail base by a `share` (n,) of a mounting posture."""
+    joints = animal.joints
+    rump, ahead = joints[:, 0], joints[:, -1] - joints[:, 0]
+    left = np.stack([-ahead[:, 1], ahead[:, 0], np.zeros(len(ahead))], axis=1)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    pitch = so3.exp(-np.radians(32.0) * share[:, None] * left)
+    lift = share[:, None] * [0.0, 0.0, 0.22 * animal.spine_mm]
+    moved = SE3(pitch, rump + lift - np.einsum("nij,nj->ni", pitch, rump))
+    return replace(animal, pose=animal.pose.moved(moved))
+
+
+def film_group(
+    seed: int,
+    n_frames: int,
+    *,
+    animals: int = 2,
+    apart: float = 0.0,
+    encounters: Sequence[str] = ENCOUNTERS,
+    sensor: Sensor = KINECT_V2_SENSOR,
+    family: str = "other",
+    spine_mm: float | None = None,
+) -> tuple[RenderedRecording, list[Act]]:
+    """A recording of mice that interact, and what they did.
+
+    Args:
+        seed: seed of all random numbers.
+        n_frames: its length, at 30 frames/s.
+        animals: their number, 2 to 4.
+        apart: difference in length between one animal and the next, share.
+        encounters: the acts, of `ENCOUNTERS`.
+        sensor: the camera's make.
+        family: of body shapes, see `body.variation`.
+        spine_mm: length of the longest animal, mm; None draws it.
+
+    Returns:
+        The recording with the truth of all animals, and the acts within it.
+    """
+    recipe = replace(RECIPES["plain"], n_animals=animals)
+    making = GroupMaking(recipe, seed, n_frames, sensor, family, spine_mm, tuple(encounters), apart)
+    acts = making.group(making._arenas()[0]).acts
+    within = [act._replace(stop=min(act.stop, n_frames)) for act in acts if act.start < n_frames]
+    return making.recording(f"pair-{seed}"), within
