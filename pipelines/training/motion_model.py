@@ -11,7 +11,7 @@ frame by frame. These fits follow on the observations:
   for each joint.
 - The unobservable part of a build: the spread of heights and of positions along the body
   (`unseen_height`, `unseen_shift`).
-- The share of a build's part in the predicted error (`expected_share`).
+- The share of a build's part in the predicted error (`expected_share`), from unusual bodies.
 
 The families are usual bodies on easy and on hard sequences, bodies of builds that no forest was
 trained on, and foreign bodies, which another program renders (`simulation.foreign`). Each has the
@@ -110,15 +110,15 @@ def train_tracking(
         for kind in ("easy", "hard")
         for seed in seeds or range(101, 109)
     ]
-    families = [
-        *measured,
+    builds = [
         *other_builds(animal, progress, seeds or BUILD_SEEDS),
         *foreign_bodies(animal, progress, seeds or FOREIGN_BODIES),
     ]
+    families = [*measured, *builds]
     tuning = calibrate_joints(families, TrackingParameters.of(animal))
     tuning = calibrate_roots(measured, tuning)
-    for calibrate in (calibrate_each_joint, calibrate_builds, calibrate_expected):
-        tuning = calibrate(families, tuning)
+    tuning = calibrate_builds(families, calibrate_each_joint(families, tuning))
+    tuning = calibrate_expected(builds or measured, tuning)
     out.write_text(tunings_with(animal, tuning), encoding="utf-8")
     return out
 
@@ -439,7 +439,8 @@ def calibrate_expected(
 ) -> TrackingParameters:
     """The tuning with the share of a build's part in the predicted error (`expected_share`).
 
-    With it, the predicted error is right in the median. Families of bodies weigh the same.
+    With it, the predicted error is right in the median over these sequences, which are of unusual
+    bodies if there are any. Families of bodies weigh the same.
     """
     shares: list[Array] = []
     kinds: list[str] = []
