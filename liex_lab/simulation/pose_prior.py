@@ -166,9 +166,16 @@ def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
 
 
 def stand(
-    skeleton: Skeleton, posture: Posture, heading: Array, size: Array, shape: BodyShape, gap: Array
+    skeleton: Skeleton,
+    posture: Posture,
+    heading: Array,
+    size: Array,
+    shape: BodyShape,
+    gap: Array,
+    middle: Array | None = None,
+    n_middle: int | None = None,
 ) -> tuple[Pose, Array]:
-    """Place postures on the floor z = 0, rump above the origin.
+    """Place postures on the floor z = 0.
 
     The rear part of the trunk is `gap` above the floor; if the front would be below it, the whole
     animal is tilted up around the rump, in at most six iterations.
@@ -180,6 +187,8 @@ def stand(
         size: (n,) of the animals over home size.
         shape: (n) their bodies.
         gap: (n,) between the floor and the lowest point of the rear, mm.
+        middle: (n, 2) mean of the joints in the floor, mm; None puts the rump above the origin.
+        n_middle: number of joints, from the rump on, whose mean is at `middle`; None is all.
 
     Returns:
         Poses (n) in the arena frame, their angles clipped to the joints' limits, and girths (n,).
@@ -221,6 +230,9 @@ def stand(
         )
     sunk = np.maximum(-(lowest.min(axis=1) + height), 0.0)
     pose.root.translation[:, 2] = height + sunk
+    if middle is not None:
+        off = middle - pose.joints(skeleton)[:, :n_middle, :2].mean(axis=1)
+        pose.root.translation[:, :2] += off
     return pose, girth
 
 

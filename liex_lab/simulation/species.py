@@ -564,7 +564,7 @@ class GenericSpecies(Species):
         slow = 0.5 / step_s
         starts = np.where(rng.random(n) < 1.0 / slow, np.arange(n), 0)
         drawn = draw_angles(rng, skeleton, n)[np.maximum.accumulate(starts)]
-        angles = smoothed(drawn.reshape(n, -1), 0.4 * slow).reshape(drawn.shape)
+        angles = smoothed(drawn, 0.4 * slow)
         speed = np.maximum(smoothed(rng.normal(0.4, 0.8, n), slow), 0.0)
         turning = smoothed(rng.normal(0.0, 3.0, n), slow)
         level = np.zeros(n)

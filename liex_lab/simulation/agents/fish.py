@@ -7,7 +7,6 @@ lengths per second. `agents.agent` filters and concatenates the actions, `fish_p
 body.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,7 +17,6 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.simulation.agents.agent import (
     CLIMB,
-    SPEED,
     STEP_S,
     UNLABELLED,
     ActedMotion,

@@ -6,7 +6,6 @@ each of the three inner joints, and the stretch of the body. `agents.agent` filt
 the actions, `mouse_poses` places the postures on the floor.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -419,7 +418,5 @@ def mouse_poses(
     posture = Posture(c[:, _RISE].copy(), turn, c[:, _ROLL].copy(), c[:, _STRETCH].copy())
     heading = motion.heading[rows] - 0.5 * c[:, _BEND].sum(axis=1)
     gap = np.full(n, rng.uniform(0.0, 2.0))
-    pose, girth = stand(skeleton, posture, heading, np.full(n, size), shape[0].broadcast(n), gap)
-    middle = pose.joints(skeleton)[:, :4, :2].mean(axis=1)
-    pose.root.translation[:, :2] += motion.position[rows, :2] - middle
-    return pose, girth
+    body, middle = shape[0].broadcast(n), motion.position[rows, :2]
+    return stand(skeleton, posture, heading, np.full(n, size), body, gap, middle, 4)

@@ -224,7 +224,7 @@ def tether(rng: np.random.Generator, mount: SE3, commutator: Array, thick_mm: fl
         Vertices (n, V, 3) mm, arena frame, and faces (F, 3).
     """
     n = len(mount.translation)
-    way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, (n, 1)), 12.0))
+    way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, n), 12.0))
     longest = float(np.linalg.norm(commutator - mount.translation, axis=-1).max())
     length = np.full(n, longest * rng.uniform(1.03, 1.08))
     return cables(_hanging(mount, commutator, length, way), 0.5 * thick_mm)
@@ -402,8 +402,7 @@ class Bedding:
             columns = np.abs(self.ground.x - spot[0]) < 20.0
             patch = self.heights[i // self.frames][np.ix_(rows, columns)]
             height[i] = float(patch.mean()) if patch.size else 0.0
-        bell = np.exp(-0.5 * (np.arange(-15, 16) / 5.0) ** 2)
-        return np.convolve(np.pad(height, 15, mode="edge"), bell / bell.sum(), mode="valid")
+        return smoothed(height, 5.0, deviations=3.0)
 
 
 def _lumps(grid: Array, places: Array, tall: Array, wide: Array) -> Array:

@@ -47,14 +47,13 @@ def draw_mouse(
     """
     moments, present = timing
     body = np.random.default_rng([seed, which, 1])
-    drawn = float(body.uniform(55.0, 75.0))
-    spine = drawn if spine_mm is None else float(spine_mm)
+    drawn = body.uniform(55.0, 75.0)
+    spine = float(drawn if spine_mm is None else spine_mm)
     shape = species.shapes(body, family, 1)
     n_moments = int(moments.max()) + 1
-    going = np.random.default_rng([seed, which, 2])
+    going, tail = (np.random.default_rng([seed, which, part]) for part in (2, 3))
     skeleton = species.skeleton
     pose, girth = walk(going, arena, skeleton, shape, spine, n_moments, script, path)
-    tail = np.random.default_rng([seed, which, 3])
     first = species.bends(tail, 1)
     bends = first + waver(tail, (n_moments, first.shape[1]))
     asleep = np.diff(moments, prepend=moments[0] - 1) == 0
@@ -104,7 +103,7 @@ def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
         pause = stop + int(_RATE_HZ * rng.uniform(0.1, 0.8))
         speed[stop:pause] = 0.0
         at = pause
-    return np.zeros(n, np.int64), np.maximum(smoothed(speed[:, None], 3.6)[:, 0], 0.0)
+    return np.zeros(n, np.int64), np.maximum(smoothed(speed, 3.6), 0.0)
 
 
 def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...]) -> Path:
@@ -123,8 +122,7 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
         rng: np.random.Generator, scene: SimulatedScene, spine_mm: float, speed: Array
     ) -> tuple[Array, Array]:
         n = len(speed)
-        position = np.empty((n, 2))
-        heading = np.empty(n)
+        position, heading = np.empty((n, 2)), np.empty(n)
         goals = [free_spot(rng, scene, 0.8 * spine_mm) for _ in range(40)]
         at = door + 0.6 * (door - inside)
         way = rng.uniform(-np.pi, np.pi)
@@ -150,8 +148,7 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
                 step = run * facing * np.array([np.cos(way), np.sin(way)])
                 if errand or scene.freedom(at + step) > 0.4 * spine_mm:
                     at = at + step
-            position[i] = at
-            heading[i] = way
+            position[i], heading[i] = at, way
         return position, heading
 
     return path
@@ -188,17 +185,11 @@ def keeping_apart(other: Array, spine_mm: float) -> Path:
     def path(
         rng: np.random.Generator, scene: SimulatedScene, own_mm: float, speed: Array
     ) -> tuple[Array, Array]:
-        best: tuple[Array, Array] | None = None
-        best_gap = -np.inf
-        for _ in range(_TRIES):
-            position, heading = free_path(rng, scene, own_mm, speed)
-            gap = float(np.linalg.norm(position - other[: len(position)], axis=1).min())
-            if gap > best_gap:
-                best = (position, heading)
-                best_gap = gap
-            if gap > 0.95 * 0.5 * (spine_mm + own_mm):
-                break
-        assert best is not None
-        return best
+        tried: list[tuple[Array, Array]] = []
+        gaps: list[float] = []
+        while len(tried) < _TRIES and (not gaps or gaps[-1] <= 0.95 * 0.5 * (spine_mm + own_mm)):
+            tried.append(free_path(rng, scene, own_mm, speed))
+            gaps.append(np.linalg.norm(tried[-1][0] - other[: len(speed)], axis=1).min())
+        return tried[int(np.argmax(gaps))]
 
     return path
