@@ -205,18 +205,17 @@ class Making:
         species = MouseSpecies()
         arenas = self._arenas()
         animals, moving, parts = self._cast(species, arenas)
-        beddings: list[Bedding] = []
         floor = self._rng("floor")
         grounds = [Ground.draw(floor, arena) for arena in arenas]
+        bedding = None
         if recipe.bedding:
-            tracks = _middle(animals[0])
-            present = np.where(animals[0].present[:, None], tracks, np.nan)
-            beddings = [Bedding.draw(self._rng("bedding"), grounds[0], present, self._epoch_frames)]
+            there = np.where(animals[0].present[:, None], _middle(animals[0]), np.nan)
+            bedding = Bedding.draw(self._rng("bedding"), grounds[0], there, self._epoch_frames)
             lift = SE3.identity(n)
-            lift.translation[:, 2] = beddings[0].below(np.nan_to_num(present))
+            lift.translation[:, 2] = bedding.below(np.nan_to_num(there))
             animals[0] = replace(animals[0], pose=animals[0].pose.moved(lift))
         moving += self._worn(species, arenas[0], animals, parts)
-        stills, epoch = self._stills(arenas, grounds, beddings, parts)
+        stills, epoch = self._stills(arenas, grounds, bedding, parts)
         fur = animals[0].body.fur if animals else np.array([0.5])
         parameters = self.sensor.draw(self._rng("sensor"), 1, fur)
         warming = 1.0 - np.exp(-np.arange(n) / max(1.0, 0.35 * n))
@@ -267,7 +266,7 @@ class Making:
 
     def _house(self, arena: SimulatedScene) -> tuple[Array, float]:
         """Position of a house, (2,) mm, and the direction of its exit, rad."""
-        corner = turned((arena.half - [85.0, 75.0]) * [1.0, 1.0], arena.yaw)
+        corner = turned(arena.half - [85.0, 75.0], arena.yaw)
         return arena.centre + corner, float(np.pi + arena.yaw)
 
     def _clutter(self, arena: SimulatedScene) -> Array:
@@ -303,13 +302,21 @@ class Making:
             still += places.house(arenas[0], place, out)
         animals: list[Actor] = []
         for which in range(max(recipe.n_animals, recipe.n_arenas) if recipe.n_animals else 0):
-            arena = arenas[which % len(arenas)]
             if which and recipe.n_arenas == 1:
                 path = keeping_apart(_middle(animals[0]), animals[0].spine_mm)
-            animal = draw_mouse(
-                self.seed, which, species, arena, self.family, self.spine_mm, timing, script, path
+            animals.append(
+                draw_mouse(
+                    self.seed,
+                    which,
+                    species,
+                    arenas[which % len(arenas)],
+                    self.family,
+                    self.spine_mm,
+                    timing,
+                    script,
+                    path,
+                )
             )
-            animals.append(animal)
         if recipe.fixture in _OBJECTS:
             change = int(_OBJECTS[recipe.fixture] * self.n_frames)
             later = np.arange(self.n_frames) >= change
@@ -362,7 +369,7 @@ class Making:
         self,
         arenas: list[SimulatedScene],
         grounds: list[Ground],
-        beddings: list[Bedding],
+        bedding: Bedding | None,
         parts: list[Mesh],
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """The still scene by epoch (E, H, W) mm, and the epoch of every frame (n,)."""
@@ -379,23 +386,21 @@ class Making:
             fixed += places.untidy(rng, arenas[0])
         else:
             fixed.append(places.level(np.mean([arena.centre for arena in arenas], axis=0)))
-        camera = arenas[0].camera
-        T_camera_arena = arenas[0].T_arena_camera.inverse()
-        floors = [] if beddings else [ground.mesh() for ground in grounds]
-        base = render_still([*fixed, *floors], camera, T_camera_arena)
-        if not (beddings or recipe.glossy):
-            return base[None], np.zeros(self.n_frames, np.int64)
-        bare = render_still(floors, camera, T_camera_arena) == base
-        epoch = np.arange(self.n_frames) // self._epoch_frames
+        camera, T_camera_arena = arenas[0].camera, arenas[0].T_arena_camera.inverse()
+        floors = [ground.mesh() for ground in grounds]
+        base, bare = (
+            render_still(parts, camera, T_camera_arena) for parts in ([*fixed, *floors], floors)
+        )
+        changes = bedding is not None or recipe.glossy
+        epoch = np.arange(self.n_frames) // self._epoch_frames * changes
         stills = np.repeat(base[None], epoch[-1] + 1, axis=0)
         for e, still in enumerate(stills):
-            for bedding in beddings:
-                mesh = bedding.ground.mesh(bedding.heights[e])
-                lain = render_still([mesh], camera, T_camera_arena)
-                nearer = (lain > 0) & ((still == 0) | (lain < still))
-                still[nearer] = lain[nearer]
+            if bedding:
+                lain = bedding.ground.mesh(bedding.heights[e])
+                still[:] = render_still([*fixed, lain], camera, T_camera_arena)
             if recipe.glossy:
-                still[bare & _reflections(self._rng("floor"), rng, camera, still.shape)] = 0.0
+                unread = _reflections(self._rng("floor"), rng, camera, still.shape)
+                still[(bare == base) & unread] = 0.0
         return stills, epoch
 
 

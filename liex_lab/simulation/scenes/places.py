@@ -20,7 +20,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.locomotion import smoothed
-from liex_lab.simulation.scene import ROUND, SimulatedScene, turned, unevenness
+from liex_lab.simulation.scene import ROUND, SimulatedScene, rounding, turned, unevenness
 
 Array = NDArray[np.float64]
 CABLE_SEGMENTS = 6
@@ -182,7 +182,7 @@ def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> S
     Returns:
         (n) T_arena_mount: x forward, z up from the skull, the origin on the skin.
     """
-    frames = pose.frames(skeleton)
+    neck = pose.frames(skeleton)[:, _NECK]
     stations = np.asarray(skeleton.surface["stations"], float)
     k = int(np.searchsorted(stations, _AT_STATION)) - 1
     share = (_AT_STATION - stations[k]) / (stations[k + 1] - stations[k])
@@ -190,9 +190,7 @@ def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> S
     reach = np.linalg.norm(skeleton.offsets[1:], axis=1)
     ahead = (_AT_STATION * reach.sum() - reach[: _NECK + 1].sum()) * pose.scale
     local = np.stack([ahead, np.zeros_like(ahead), thick * girth], axis=-1)
-    rotation = frames.rotation[:, _NECK]
-    shift = np.einsum("nij,nj->ni", rotation, local)
-    return SE3(rotation, frames.translation[:, _NECK] + shift)
+    return SE3(neck.rotation, neck @ local)
 
 
 def stage_on(mount: SE3, sides_mm: tuple[float, float, float]) -> Mesh:
@@ -207,8 +205,7 @@ def stage_on(mount: SE3, sides_mm: tuple[float, float, float]) -> Mesh:
     """
     half = 0.5 * np.array(sides_mm)
     block = box([0.0, 0.0, half[2] - 1.0], half)
-    placed = np.einsum("nij,vj->nvi", mount.rotation, block.vertices) + mount.translation[:, None]
-    return Mesh(placed, block.faces)
+    return Mesh(mount[:, None] @ block.vertices, block.faces)
 
 
 def tether(rng: np.random.Generator, mount: SE3, commutator: Array, thick_mm: float) -> Mesh:
@@ -303,20 +300,16 @@ class Ground:
         local = np.stack(np.meshgrid(x, y), axis=-1)
         heights = unevenness(rng, local, most=0.6)
         clearance = arena.wall_clearance(arena.centre + turned(local, arena.yaw))
-        if arena.wall_mm > 0:
-            heights += rng.uniform(0.0, 8.0) * np.exp(
-                -np.maximum(clearance, 0.0) / rng.uniform(6.0, 18.0)
-            )
+        heights += rounding(rng, clearance, 8.0, 18.0)
         return Ground(arena, x, y, heights, clearance > -1.5 * _GRID_MM)
 
-    def mesh(self, bedding: Array | None = None) -> Mesh:
+    def mesh(self, bedding: Array | float = 0.0) -> Mesh:
         """The floor as a mesh in the arena frame.
 
         Args:
-            bedding: (m, n) heights of bedding, mm; None for no bedding.
+            bedding: (m, n) heights of bedding on it, mm.
         """
-        heights = self.heights if bedding is None else self.heights + bedding
-        flat = field(self.x, self.y, heights)
+        flat = field(self.x, self.y, self.heights + bedding)
         xy = self.arena.centre + turned(flat.vertices[:, :2], self.arena.yaw)
         inside = self.within.ravel()[flat.faces].all(axis=1)
         return Mesh(np.concatenate([xy, flat.vertices[:, 2:]], axis=1), flat.faces[inside])
@@ -361,9 +354,8 @@ class Bedding:
             The bedding of all epochs.
         """
         grid = np.stack(np.meshgrid(ground.x, ground.y), axis=-1)
-        area = float(np.prod(2.0 * ground.arena.half))
         # one lump per square of 26 mm
-        n_lumps = int(area / 26.0**2)
+        n_lumps = int(np.prod(2.0 * ground.arena.half) / 26.0**2)
         places = rng.uniform(-1.0, 1.0, (n_lumps, 2)) * ground.arena.half
         tall = _LUMP_MM * rng.uniform(0.35, 1.0, n_lumps)
         wide = rng.uniform(8.0, 18.0, n_lumps)
@@ -418,15 +410,13 @@ def walls_of(arena: SimulatedScene, slope: float = 0.0, rim_mm: float = _RIM_MM)
     """The walls of an arena.
 
     Args:
-        arena: the arena; a wall height of 0 has none.
+        arena: the arena.
         slope: horizontal distance of the rim outside the foot, mm.
         rim_mm: width of the rim, mm.
 
     Returns:
         Their meshes.
     """
-    if arena.wall_mm <= 0.0:
-        return []
     return [wall(outline_of_walls(arena), -_BASE_MM, arena.wall_mm, rim_mm, slope)]
 
 
