@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import parse_qsl
@@ -46,10 +46,10 @@ def world_of(skeleton: Skeleton) -> Species:
 # Benchmark sequences for tracking: one moving animal, clean or corrupted, with exact truth.
 
 
-# frames, as in the paper; own seed; noise; eroded pixels; whether there are corruptions
-SEQUENCES = {
-    "easy": (511, 75_001, 1.0, 0, False),
-    "hard": (300, 76_001, 2.0, 1, True),
+# frames, as in the paper; own seed; settings, see `Take`; whether there are corruptions
+SEQUENCES: Mapping[str, tuple[int, int, Mapping[str, Any], bool]] = {
+    "easy": (511, 75_001, {}, False),
+    "hard": (300, 76_001, {"noise": 2.0, "erosion_px": 1}, True),
 }
 
 
@@ -84,8 +84,7 @@ def tracking_sequence(
     """
     if name not in SEQUENCES:
         raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
-    sensor = sensor or world.sensors[0]
-    usual_frames, usual_seed, noise, erosion_px, corrupted = SEQUENCES[name]
+    usual_frames, usual_seed, settings, corrupted = SEQUENCES[name]
     n = n_frames or usual_frames
     own_seed = [usual_seed if seed is None else seed]
     rng = np.random.default_rng([*own_seed, 1])
@@ -99,10 +98,9 @@ def tracking_sequence(
     base = world.motion(
         own_seed,
         int(rows[-1]) + 1,
-        sensor=sensor,
-        noise=noise,
-        erosion_px=erosion_px * sensor.stride,
+        sensor=sensor or world.sensors[0],
         spine_mm=spine_mm,
+        **settings,
     )
     times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(world.frame_ns)
     joints, length = base.joints_camera[rows], base.spine_mm

@@ -243,12 +243,12 @@ class BehaviourSequence:
         Returns:
             The motion on the 5 ms clock.
         """
-        channels, headings, positions, words = zip(*self._actions, strict=True)
-        lengths = [len(heading) for heading in headings]
+        *parts, words = zip(*self._actions, strict=True)
+        lengths = [len(heading) for heading in parts[1]]
         act = np.repeat(np.arange(len(words)), lengths)
         late = np.maximum(np.arange(len(act)) - min(self._lag, lengths[0]), 0)
-        parts = (np.concatenate(part) for part in (channels, headings, positions))
-        return ActedMotion(*parts, np.array(words)[act[late]], act[late])
+        channels, heading, position = (np.concatenate(part) for part in parts)
+        return ActedMotion(channels, heading, position, np.array(words)[act[late]], act[late])
 
 
 def clock(seconds: float) -> Array:

@@ -7,6 +7,7 @@ lengths per second. `agents.agent` filters and concatenates the actions, `fish_p
 body.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -195,7 +196,7 @@ class FishActor:
             (m, 8): speed mm/s, turning rad/s, climb rad, roll rad, bend of the front and of the
             hind half and amplitude of the wave in degrees per joint, beat Hz.
         """
-        return {
+        actions: dict[str, Callable[[np.random.Generator], Array]] = {
             "scoot": self._scoot,
             "j_turn": self._j_turn,
             "c_turn": self._c_turn,
@@ -205,7 +206,8 @@ class FishActor:
             "zigzag": self._zigzag,
             "thrash": self._thrash,
             "freeze": self._freeze,
-        }[word](rng)
+        }
+        return actions[word](rng)
 
     def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
         return self.fish.duration(rng, shortest, longest, 0.15)

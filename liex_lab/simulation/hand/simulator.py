@@ -34,10 +34,10 @@ from liex_lab.recordings.formats.images.nyu import (
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import sight_rotations
 from liex_lab.simulation import _render_kernels as kernels
-from liex_lab.simulation import training_patches
+from liex_lab.simulation import recording, training_patches
 from liex_lab.simulation._sensor_kernels import ANIMAL, PRIMESENSE_KIND
 from liex_lab.simulation.hand.postures import draw_postures, draw_turns
-from liex_lab.simulation.recording import OTHER_CAMERA, Actor, Split, Stage
+from liex_lab.simulation.recording import Actor, Split, Stage, Take
 from liex_lab.simulation.rendering import Solid, Views, inverse_depth
 from liex_lab.simulation.scene import BOX, SPHERE_TUBE, SimulatedScene, rounded
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor, draw_units, unseen
@@ -326,11 +326,9 @@ def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, bod
 
 
 NYU_SENSOR = Sensor("NYU Kinect", LABEL_CAMERA, PRIMESENSE_KIND)
+# as of other animals, with other seeds
 SPLITS: Mapping[str, Split] = {
-    "clean": (81_001, "train", 1.0, 0, 0.0),
-    "hard": (82_001, "train", 2.0, 1, 0.5),
-    "other-body": (84_001, "other", 1.0, 0, 0.0),
-    OTHER_CAMERA: (85_001, "train", 1.0, 0, 0.0),
+    name: (seed + 10_000, settings) for name, (seed, settings) in recording.SPLITS.items()
 }
 # training images: (sensor, nearest and farthest hand, share)
 _KINDS = (
@@ -453,25 +451,14 @@ class HandSpecies(Species):
             own_bones=True,
         )
 
-    def _stage(
-        self,
-        rng: np.random.Generator,
-        sensor: Sensor,
-        length: float,
-        n: int,
-        moving: bool,
-        family: str,
-        noise: float,
-        erosion_px: int,
-        object_share: float,
-    ) -> Stage:
-        skeleton, camera = self.skeleton, sensor.camera
-        shape = draw_hands(rng, skeleton, family, 1)[np.zeros(n, np.int64)]
+    def _stage(self, rng: np.random.Generator, take: Take, length: float) -> Stage:
+        skeleton, camera, n = self.skeleton, take.sensor.camera, take.n_frames
+        shape = draw_hands(rng, skeleton, take.family, 1)[np.zeros(n, np.int64)]
         intrinsics = np.tile(camera.intrinsics, (n, 1))
         size_px = np.tile(np.array([camera.width, camera.height]), (n, 1))
-        act = self._gestures if moving else self._test_hands
+        act = self._gestures if take.moving else self._test_hands
         angles, turns, places, wrists = act(rng, intrinsics, size_px)
-        parameters = sensor.draw(rng, 1, np.zeros(1), noise, erosion_px)
+        parameters = take.parameters(rng, np.zeros(1))
         pose = pose_hands(angles, turns, np.full(n, length / skeleton.length), places)
         T = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1300.0, camera).T_arena_camera
         hand, objects, walls = surround(
@@ -479,21 +466,24 @@ class HandSpecies(Species):
             pose,
             shape,
             intrinsics,
-            object_share,
-            n if moving else 1,
+            take.object_share,
+            n if take.moving else 1,
             wrists,
             Surface.of(skeleton),
             T,
         )
+        scene = SimulatedScene(camera, T, BOX, np.zeros(2), np.full(2, np.inf), 0.0, 0.0)
         return Stage(
-            SimulatedScene(camera, T, BOX, np.zeros(2), np.full(2, np.inf), 0.0, 0.0),
+            scene,
             skeleton,
             (hand,),
             objects,
-            np.repeat(parameters, n, axis=0),
+            parameters,
             rng.integers(1, 2**63, n).astype(np.uint64),
             np.arange(n) * self.frame_ns,
-            ground=walls,
+            scene.still[None],
+            np.zeros(n, np.int64),
+            walls,
         )
 
     def _test_hands(

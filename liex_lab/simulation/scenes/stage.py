@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.shape import Surface
 from liex_lab.simulation.locomotion import Path, Script, free_path, smoothed, walk, waver
-from liex_lab.simulation.recording import Actor
+from liex_lab.simulation.recording import Actor, Take
 from liex_lab.simulation.scene import SimulatedScene
 from liex_lab.simulation.species import MouseSpecies
 
@@ -26,8 +26,7 @@ def draw_mouse(
     which: int,
     species: MouseSpecies,
     arena: SimulatedScene,
-    family: str,
-    spine_mm: float | None,
+    take: Take,
     timing: tuple[NDArray[np.int64], NDArray[np.bool_]],
     script: Script | None = None,
     path: Path | None = None,
@@ -39,8 +38,7 @@ def draw_mouse(
         which: number of the animal.
         species: the mouse.
         arena: the arena.
-        family: of body shapes, see `draw_shapes`.
-        spine_mm: its length, mm; None draws it.
+        take: its length and the family of its body's shape.
         timing: index of the moment of its walk in each frame (n,), and its presence (n,).
         script: its activity, see `locomotion.walk`.
         path: its path, likewise.
@@ -48,8 +46,8 @@ def draw_mouse(
     moments, present = timing
     body = np.random.default_rng([seed, which, 1])
     drawn = body.uniform(55.0, 75.0)
-    spine = float(drawn if spine_mm is None else spine_mm)
-    shape = species.shapes(body, family, 1)
+    spine = float(drawn if take.spine_mm is None else take.spine_mm)
+    shape = species.shapes(body, take.family, 1)
     n_moments = int(moments.max()) + 1
     going, tail = (np.random.default_rng([seed, which, part]) for part in (2, 3))
     skeleton = species.skeleton
