@@ -268,25 +268,17 @@ class SimulatedScene:
         wall_mm = rng.uniform(low, min(high, 0.7 * height))
         wall_mm *= rng.random() >= setting.open_share  # else an open table
         scene = SimulatedScene(camera, T_arena_camera, kind, centre, half, yaw, wall_mm)
-        return scene._furnished(rng, spine_mm, setting)
-
-    def _furnished(
-        self, rng: np.random.Generator, spine_mm: float, setting: SceneSpec
-    ) -> "SimulatedScene":
-        """The scene with its depth image, and in a third of cases with one or two objects."""
-        still = self._ideal_depth(rng, setting.scale)
-        T_camera_arena = self.T_arena_camera.inverse()
-        outline = []
+        still = scene._ideal_depth(rng, setting.scale)
+        outline = [np.zeros((0, 2))]
         for _ in range(rng.choice([0, 1, 2], p=[0.65, 0.25, 0.10])):
             mesh = draw_object(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
             azimuth = rng.uniform(-np.pi, np.pi)
-            local = 0.8 * self.half * [np.cos(azimuth), np.sin(azimuth)]
-            mesh[:, :2] += self.centre + turned(local, self.yaw)
-            item = render_mesh(mesh, OBJECT_FACES, self.camera, T_camera_mesh=T_camera_arena)
+            local = 0.8 * half * [np.cos(azimuth), np.sin(azimuth)]
+            mesh[:, :2] += centre + turned(local, yaw)
+            item = render_mesh(mesh, OBJECT_FACES, camera, T_camera_mesh=T_arena_camera.inverse())
             still = np.where((item > 0) & ((still == 0) | (item < still)), item, still)
             outline.append(mesh[:, :2])
-        clutter = np.concatenate(outline) if outline else np.zeros((0, 2))
-        return replace(self, clutter=clutter, still=still)
+        return replace(scene, clutter=np.concatenate(outline), still=still)
 
     def wall_clearance(self, xy: Array) -> Array:
         """Signed distance of floor points from the walls, mm; negative outside.

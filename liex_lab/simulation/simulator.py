@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import parse_qsl
@@ -34,11 +35,10 @@ def world_of(skeleton: Skeleton) -> Species:
     Returns:
         The species; the hand uses labelled test postures if `find_reference` finds any.
     """
-    if skeleton.name == "hand":
-        return HandSpecies(skeleton, reference=find_reference())
     known: dict[str, Callable[[Skeleton], Species]] = {
         "mouse": MouseSpecies,
         "fish": FishSpecies,
+        "hand": lambda hand: HandSpecies(hand, reference=find_reference()),
     }
     return known.get(skeleton.name, GenericSpecies.of)(skeleton)
 
@@ -175,11 +175,9 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             **_settings(kind, 1.0),
         }
         del settings["spine_mm"]
-        missing: dict[str, Any] = {"animal": "mouse", "body": 0, "seed": 0, "frames": 300}
-        session = ForeignRecording(**(missing | _values(address, stated, settings)))
+        session = ForeignRecording(**_values(address, stated, settings))
     else:
-        usual = "mouse" if kind in _SEQUENCES else ""
-        animal = _ANIMALS.get(kind) or stated.pop("animal", usual)
+        animal = _ANIMALS.get(kind) or stated.pop("animal", "mouse" if kind in _SEQUENCES else "")
         if not animal:
             raise RecordingError(
                 f"{address} lacks the animal that moves, as in "
@@ -193,8 +191,9 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             session = tracking_sequence(world, _SEQUENCES[kind], **values)
         else:
             seed = values.pop("seed", 0)
-            n_frames = values.pop("frames", 300)
-            session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
+            session = world.motion(
+                seed, values.pop("frames", 300), name=f"synthetic-{kind}-{seed}", **values
+            )
     if camera is not None:
         session.camera = fitting(
             camera, session.width, session.height, "the camera that was stated"
@@ -225,13 +224,13 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
             f"{address}: seeds from {SEALED_FROM} on are kept for `liex evaluate scenes --sealed`; "
             "take a smaller one"
         )
-    family = values.pop("build", _BUILDS[0])
-    return film(named, seed, values.pop("frames", 300), family=family, **values)
+    n_frames, family = values.pop("frames", 300), values.pop("build", _BUILDS[0])
+    return film(named, seed, n_frames, family=family, **values)
 
 
 def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting]) -> dict[str, Any]:
     """The values of an address's settings, validated against the settings of its kind."""
-    values = {}
+    values: dict[str, Any] = {}
     for key, text in stated.items():
         if key not in settings:
             near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
@@ -239,11 +238,9 @@ def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting])
                 f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}"
             )
         read, holds, expected = settings[key]
-        try:
+        with suppress(KeyError, ValueError):
             values[key] = read(text)
-        except (KeyError, ValueError):
-            values[key] = None
-        if values[key] is None or not holds(values[key]):
+        if key not in values or not holds(values[key]):
             raise RecordingError(
                 f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}"
             )

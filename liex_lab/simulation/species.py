@@ -81,6 +81,7 @@ class Species:
         splits: the test splits.
         sealed_seed: of the held-out split, see `recording.SEALED`.
         patch_px: side of training patches, px, enough for mice of up to 70 mm.
+        other_builds: whether errors of tracks are also calibrated on builds not used in training.
         sources: source of the training images.
     """
 
@@ -94,6 +95,7 @@ class Species:
     splits: ClassVar[Mapping[str, Split]] = SPLITS
     sealed_seed: ClassVar[int] = SEALED_SEED
     patch_px: ClassVar[int] = 144
+    other_builds: ClassVar[bool] = True
     sources: ClassVar[str] = "rendered from a seed; no recording of an animal was used"
 
     @property
@@ -328,10 +330,13 @@ class Species:
         training_patches.degrade(rng, parameters, degraded_share)
         T_arena_camera = draw_views(rng, m, self.setting)
         size = (nominal * rng.uniform(*self.sizes, m))[each]
-        rough = scale * rng.uniform(0.0, 1.0, m)
-        error = rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale]
         views = training_patches.floor_views(
-            intrinsics, size_px, T_arena_camera, parameters, error, rough
+            intrinsics,
+            size_px,
+            T_arena_camera,
+            parameters,
+            rough=scale * rng.uniform(0.0, 1.0, m),
+            error=rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale],
         )[each]
         height = views.T_arena_camera.translation[:, 2]
         pose, girth = self.postures(rng, size, body[each], height)

@@ -162,9 +162,10 @@ class Hand(Actor):
     @property
     def solids(self) -> tuple[Solid, ...]:
         """The hand and the arm."""
-        faces = self.body.flesh.faces, ARM_FACES
-        meshes = zip((self.hand, self.arm), faces, strict=True)
-        return tuple(Solid.of(*mesh, self.present, ANIMAL) for mesh in meshes)
+        return (
+            Solid.of(self.hand, self.body.flesh.faces, self.present, ANIMAL),
+            Solid.of(self.arm, ARM_FACES, self.present, ANIMAL),
+        )
 
 
 def pose_hands(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pose:
@@ -269,9 +270,8 @@ def surround(
         T @ hand,
         T @ arm,
     )
-    mesh = item.vertices()
-    objects = Solid.of(T @ body, BODY_FACES), replace(item, mesh=(T @ mesh).__getitem__)
-    return actor, objects, walls
+    item = replace(item, mesh=(T @ item.vertices()).__getitem__)
+    return actor, (Solid.of(T @ body, BODY_FACES), item), walls
 
 
 def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
@@ -361,6 +361,7 @@ class HandSpecies(Species):
     splits: ClassVar[Mapping[str, Split]] = SPLITS
     sealed_seed: ClassVar[int] = 980_413
     patch_px: ClassVar[int] = 320
+    other_builds: ClassVar[bool] = False
     sources: ClassVar[str] = (
         "rendered from a seed; bones and postures from published anatomy; no depth image and no "
         "label of a real hand was used"
@@ -402,18 +403,17 @@ class HandSpecies(Species):
         n, surface = training_patches.BLOCK, Surface.of(self.skeleton)
         m = n // per_session
         each = np.repeat(np.arange(m), per_session)
-        nearest, farthest, share = np.array([kind[1:] for kind in _KINDS]).T
+        sensors = tuple(sensor for sensor, *_ in _KINDS)
+        nearest, farthest, share = np.array([numbers for _, *numbers in _KINDS]).T
         make = rng.choice(len(_KINDS), m, p=share)
-        sensors = tuple(kind[0] for kind in _KINDS)
         intrinsics, size_px, parameters = draw_units(rng, sensors, make, np.zeros(m))
         size_px[:, 1] = np.maximum(size_px[:, 1], self.patch_px)
         training_patches.degrade(rng, parameters, degraded_share)
-        flat = np.zeros((m, 3))
-        ground = np.zeros((m, kernels.N_GROUND))
+        ground, flat = np.zeros((m, kernels.N_GROUND)), np.zeros((m, 3))
         views = Views(intrinsics, size_px, SE3.identity(m), parameters, ground, flat)[each]
         shape = draw_hands(rng, self.skeleton, family, m)[each]
         size = (nominal * rng.uniform(*self.sizes, m))[each]
-        low, high = np.array([nearest, farthest])[:, make[each]]
+        low, high = nearest[make[each]], farthest[make[each]]
         turns = draw_turns(rng, n, anywhere=0.4)
         places = draw_places(rng, views.intrinsics, views.size_px, low, high)
         pose = pose_hands(draw_postures(rng, self.skeleton, n), turns, size, places)
@@ -433,9 +433,9 @@ class HandSpecies(Species):
         # an arm leaves a window as it leaves an image
         origin = views.around(hand.hand, window_px, shift)
         origin = np.clip(origin, 0, np.maximum(views.size_px - window_px, 0))
-        solids = [*hand.solids, *objects]
-        shape_px = (window_px, window_px)
-        depth, _ = replace(views, ground=walls).render(solids, seeds, origin, shape_px)
+        depth, _ = replace(views, ground=walls).render(
+            [*hand.solids, *objects], seeds, origin, (window_px, window_px)
+        )
         return TrainingPatches(
             depth,
             np.broadcast_to(np.zeros(1, np.uint16), depth.shape),

@@ -50,15 +50,14 @@ def draw_mouse(
     shape = species.shapes(body, take.family, 1)
     n_moments = int(moments.max()) + 1
     going, tail = (np.random.default_rng([seed, which, part]) for part in (2, 3))
-    skeleton = species.skeleton
-    pose, girth = walk(going, arena, skeleton, shape, spine, n_moments, script, path)
+    pose, girth = walk(going, arena, species.skeleton, shape, spine, n_moments, script, path)
     first = species.bends(tail, 1)
     bends = first + waver(tail, (n_moments, first.shape[1]))
     asleep = np.diff(moments, prepend=moments[0] - 1) == 0
     # share of the girth; breaths per frame
     breath = 1.0 + 0.012 * np.sin(2 * np.pi * 2.5 * np.arange(len(moments)) / _RATE_HZ)
     girth = girth[moments] * np.where(asleep, breath, 1.0)
-    surface = Surface.of(skeleton)
+    surface = Surface.of(species.skeleton)
     return Actor(surface, spine, shape, pose[moments], girth, bends[moments], present)
 
 
