@@ -81,8 +81,8 @@ class Take:
             rng: random number generator.
             fur: (1,) of the animal, from 0 to 1.
         """
-        eroded = self.erosion_px * self.sensor.stride
-        return np.repeat(self.sensor.draw(rng, 1, fur, self.noise, eroded), self.n_frames, axis=0)
+        unit = self.sensor.draw(rng, 1, fur, self.noise, self.erosion_px * self.sensor.stride)
+        return np.repeat(unit, self.n_frames, axis=0)
 
 
 @dataclass(frozen=True)
@@ -264,11 +264,10 @@ class RenderedRecording(Recording):
 
     def _truth(self, actor: Actor) -> TrueAnimal:
         joints = self._sides * (self.T_arena_camera.inverse() @ actor.joints)
-        joints[~actor.present] = np.nan
+        there = actor.present
         share = np.zeros(len(self))
-        rows = np.flatnonzero(actor.present)
-        share[rows] = self.visible(actor, rows)
-        return TrueAnimal(actor.spine_mm, joints, share)
+        share[there] = self.visible(actor, np.flatnonzero(there))
+        return TrueAnimal(actor.spine_mm, np.where(there[:, None, None], joints, np.nan), share)
 
     def visible(self, actor: Actor, rows: NDArray[np.int64]) -> Array:
         """Share of an animal's body that is inside the image and not occluded.
@@ -376,20 +375,20 @@ def distractor(
             gap = np.linalg.norm((mesh[::3, None] + shift[i])[..., :2] - own, axis=-1).min()
             # a hand reaches over the wall; other objects are inside
             within = mesh[:, 2].max() > 0.6 * spine_mm or scene.wall_clearance(shift[i, :2]) > 0
-            free = bool(gap > 8.0 * scale and within)
-            if free and not _covers(scene, mesh + shift[i], trunk[i], 4.0 * take.sensor.stride):
+            apart = gap > 8.0 * scale and within
+            if apart and not _covers(scene, mesh + shift[i], trunk[i], 4.0 * take.sensor.stride):
                 break
         else:
             shown[i] = False
-    moment = np.where(shown, np.arange(n), -1)
-    return Solid(OBJECT_FACES, moment, lambda rows: mesh + shift[rows, None])
+    return Solid(
+        OBJECT_FACES, np.where(shown, np.arange(n), -1), lambda rows: mesh + shift[rows, None]
+    )
 
 
 def _covers(scene: SimulatedScene, item: Array, trunk: Array, margin_px: float) -> bool:
     """Whether the distractor and the animal overlap in the image, or nearly so."""
     T_camera_arena = scene.T_arena_camera.inverse()
-    a = scene.camera.project(T_camera_arena @ item)
-    b = scene.camera.project(T_camera_arena @ trunk)
+    a, b = (scene.camera.project(T_camera_arena @ points) for points in (item, trunk))
     gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
     middle = b.mean(axis=0)
     around = (a.min(axis=0) < middle).all() and (a.max(axis=0) > middle).all()

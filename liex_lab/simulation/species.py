@@ -195,14 +195,15 @@ class Species:
             seed, settings = self.splits[kind]
             sensors = self.other_sensors if kind == OTHER_CAMERA else self.sensors
             turn = k // len(self.splits) if name == SEALED else k
-            recording = self.film(
-                [self.sealed_seed if name == SEALED else seed, k],
-                sensor=sensors[turn % len(sensors)],
-                spine_mm=spine_mm,
-                name=f"{name}-{k:02d}",
-                **settings,
+            recordings.append(
+                self.film(
+                    [self.sealed_seed if name == SEALED else seed, k],
+                    sensor=sensors[turn % len(sensors)],
+                    spine_mm=spine_mm,
+                    name=f"{name}-{k:02d}",
+                    **settings,
+                )
             )
-            recordings.append(recording)
         return recordings
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> RenderedRecording:
@@ -231,8 +232,8 @@ class Species:
         rng = np.random.default_rng(seed)
         take = Take(n_frames, sensor or self.sensors[-1], **settings)
         length = float(take.spine_mm or self.skeleton.length * rng.uniform(*self.sizes))
-        stage = self._stage(rng, take, length)
-        return RenderedRecording(take.name or f"synthetic-{self.skeleton.name}", stage)
+        title = take.name or f"synthetic-{self.skeleton.name}"
+        return RenderedRecording(title, self._stage(rng, take, length))
 
     def _stage(self, rng: np.random.Generator, take: Take, length: float) -> Stage:
         """Everything before the camera in `film`, of an animal of a given length, mm."""

@@ -370,7 +370,7 @@ class Making:
         fixed = list(parts)
         for arena in arenas:
             lid = recipe.fixture == "lid"
-            fixed += places.walls_of(arena, *((14.0, 13.0) if lid else ()))
+            fixed.append(places.walls_of(arena, *((14.0, 13.0) if lid else ())))
             fixed += places.lid_bars(arena) if lid else []
         if recipe.around == "table":
             fixed += places.table(rng, arenas[0], 480.0)
@@ -417,12 +417,11 @@ def _reflections(
     """
     v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
     strength = np.full(shape, -1.0)
-    spots = [(camera.cx, camera.cy, 26.0)]
-    spots += [
+    patches = [
         (same.uniform(0.2, 0.8) * camera.width, same.uniform(0.2, 0.8) * camera.height, r)
         for r in same.uniform(5.0, 16.0, 7)
     ]
-    for at_u, at_v, radius in spots:
+    for at_u, at_v, radius in [(camera.cx, camera.cy, 26.0), *patches]:
         wide = same.uniform(0.8, 2.2)
         way = same.uniform(-np.pi, np.pi)
         x, y = (turned(np.stack([u - at_u, v - at_v], axis=-1), way) / radius).transpose(2, 0, 1)
