@@ -146,7 +146,6 @@ class BehaviourSequence:
     Attributes:
         position: (3,) of the body's centre, mm, arena frame.
         heading: rad.
-
     """
 
     def __init__(
@@ -204,7 +203,6 @@ class BehaviourSequence:
                 self.position = position[-1]
                 self.heading = float(heading[-1])
                 self._actions.append((channels, heading, position, word))
-
                 return True
         return False
 
@@ -222,7 +220,7 @@ class BehaviourSequence:
             Names of actions to play.
         """
         own = np.array(list(shares.values())) * np.exp(rng.normal(0.0, 0.25, len(shares)))
-        while sum(len(heading) for _, heading, *_ in self._actions) * STEP_S < seconds:
+        while sum(len(channels) for channels, *_ in self._actions) * STEP_S < seconds:
             yield str(rng.choice(list(shares), p=own / own.sum()))
 
     def nudge(self, position: Array) -> None:
