@@ -637,7 +637,7 @@ class Surface:
             pose: a batch (...).
             shape: the animal; None is the default animal without ears, feet and tail.
             girth: (...) multiplies all lengths across the body; None uses the pose's scale.
-            bends: (n, TAIL_RINGS) rad, the tail's turn at each ring; None is straight.
+            bends: (n or 1, TAIL_RINGS) rad, the tail's turn at each ring; None is straight.
             parallel: whether to use all threads.
 
         Returns:
@@ -659,7 +659,9 @@ class Surface:
                 return body.vertices(rotations, joints, scale, across).reshape(*batch, -1, 3)
             assert isinstance(body, BodyShape)
             tube = body.broadcast(n)
-            straight = np.zeros((n, skinning_kernels.TAIL_RINGS))
+            turns = np.broadcast_to(
+                0.0 if bends is None else bends, (n, skinning_kernels.TAIL_RINGS)
+            )
             out = np.empty((n, self.n_vertices, 3))
             in_parallel(
                 skinning_kernels.skin_tubes,
@@ -672,7 +674,7 @@ class Surface:
                 tube.power,
                 tube.blobs,
                 tube.tail,
-                straight if bends is None else np.asarray(bends, float),
+                turns.astype(float, order="C"),
                 out,
             )
             return out.reshape(*batch, -1, 3)

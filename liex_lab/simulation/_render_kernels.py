@@ -154,10 +154,8 @@ def draw_onto(vertices, faces, rotation, translation, intrinsics, u0, v0, label,
     """
     projected = np.empty((len(vertices), 3))
     project(vertices, rotation, translation, intrinsics, projected)
-    low_u = 1e9
-    low_v = 1e9
-    high_u = -1e9
-    high_v = -1e9
+    low_u = low_v = 1e9
+    high_u = high_v = -1e9
     for i in range(len(vertices)):
         if projected[i, 2] > 0.0:
             low_u = min(low_u, projected[i, 0])

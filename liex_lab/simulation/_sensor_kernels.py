@@ -233,14 +233,12 @@ def primesense(depth, what, p, focal, state, table, out):
             column = min(max(u + int(round(jitter * move_u[v, u])), 0), width - 1)
             z = depth[row, column]
             if z <= 0.0 or shadow[column]:
-                out[v, u] = 0
                 continue
             step = abs(_step(depth, row, column)) * focal / z
             drop = p[HOLES] + (p[DARK] if what[row, column] == ANIMAL else 0.0)
             if step > 3.0:
                 drop += p[EDGE_DROP] * min((step - 3.0) / 6.0, 1.0)
             if uniform(state) < drop * strength:
-                out[v, u] = 0
                 continue
             noise = strength * (p[SMOOTH] * field[v, u] + p[WHITE] * normal(state, table))
             disparity = np.round((fb / z + noise) * SUBPIXEL) / SUBPIXEL
@@ -292,7 +290,6 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
         for u in range(width):
             z = depth[v, u]
             if z <= 0.0:
-                out[v, u] = 0
                 continue
             step = _step(depth, v, u)
             slope = min(abs(step) * focal / z, 3.0)
@@ -304,7 +301,6 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
                 if uniform(state) < p[FLYING]:
                     z += step * uniform(state) * 0.9
             if uniform(state) < drop * strength:
-                out[v, u] = 0
                 continue
             spread = (0.5 + 0.5 * far2) * corner * (1.0 + 0.5 * slope) * strength
             z += spread * (p[SMOOTH] * field[v, u] + p[WHITE] * normal(state, table))
@@ -350,13 +346,11 @@ def light_field(depth, what, p, state, table, out):
             if p[SIDE] > 0.0 and here > 0.0 and here < z:  # a near surface grows outwards only
                 z = here
             if z <= 0.0:
-                out[v, u] = 0
                 continue
             spread = strength * (z * per_mm) * (z * per_mm)
             animal = what[row, column] == ANIMAL
             if blank[v, u] + 0.3 * fine[v, u] < (p[DARK] if animal else p[HOLES]):
                 if p[FLYING] < 0.5:
-                    out[v, u] = 0
                     continue
                 z += 1.5 * spread * p[SMOOTH] * coarse[v, u]
             if abs(wrong[v, u]) > p[OUTLIERS] - 0.25 * (strength - 1.0):
@@ -385,6 +379,7 @@ def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
         out: (H, W) uint16 in steps of `p[UNIT]` mm, output, 0 = unread.
     """
     soften(depth, what, p, state, table, field)
+    out[:] = 0
     if int(p[KIND]) == PRIMESENSE_KIND:
         primesense(depth, what, p, focal, state, table, out)
     elif int(p[KIND]) == LIGHT_FIELD_KIND:

@@ -65,12 +65,11 @@ def draw_script(
     """
     events = []
     steps = np.ones(n_frames, np.int64)
-    deck = [str(name) for name in rng.permutation(list(EVENTS))]
+    names = [name for name, (share, *_) in EVENTS.items() for _ in range(share)]
+    deck = rng.permutation(list(EVENTS)).tolist()
     at = round(1.0 / step_s)  # one second without events at the start
     while at < n_frames:
-        if not deck:
-            names = [name for name, (share, *_) in EVENTS.items() for _ in range(share)]
-            deck = [str(name) for name in rng.permutation(names)]
+        deck = deck or rng.permutation(names).tolist()
         kind = deck.pop()
         length = max(2, round(rng.uniform(*EVENTS[kind][1:]) / step_s))
         stop = min(at + (1 if kind == "dropped" else length), n_frames)

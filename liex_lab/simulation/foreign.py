@@ -108,7 +108,9 @@ class ForeignRecording(Recording):
         length_mm: length of the animal's spine, mm.
     """
 
-    def __init__(self, animal: str, body: int, seed: int, frames: int) -> None:
+    def __init__(
+        self, animal: str = "mouse", body: int = 0, seed: int = 0, frames: int = 300
+    ) -> None:
         """Draw a body by its number, and everything else by the seed.
 
         Args:

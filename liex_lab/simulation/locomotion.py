@@ -88,22 +88,11 @@ def walk(
     position, heading = (path or free_path)(rng, scene, spine_mm, spines_per_s * spine_mm)
     # the trunk sways with the stride
     phase = 2 * np.pi * np.cumsum(np.sqrt(spines_per_s) * 1.6) / _RATE_HZ
-    posture.turn[:, 1:-1] += (0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase))[:, None] * [
-        1.0,
-        -0.5,
-        -0.5,
-    ]
-    pose, girth = stand(
-        skeleton,
-        posture,
-        heading,
-        np.full(n_frames, spine_mm / skeleton.length),
-        body,
-        smoothed(rng.uniform(0.0, 3.0, n_frames), _BLEND_S * _RATE_HZ),
-    )
-    middle = pose.joints(skeleton)[..., :2].mean(axis=1)
-    pose.root.translation[:, :2] += position - middle
-    return pose, girth
+    sway = 0.06 * np.minimum(spines_per_s, 1.0) * np.sin(phase)
+    posture.turn[:, 1:-1] += sway[:, None] * [1.0, -0.5, -0.5]
+    size = np.full(n_frames, spine_mm / skeleton.length)
+    gap = smoothed(rng.uniform(0.0, 3.0, n_frames), _BLEND_S * _RATE_HZ)
+    return stand(skeleton, posture, heading, size, body, gap, position)
 
 
 def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
@@ -112,19 +101,17 @@ def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
     Returns:
         Kinds of posture (n,), indices into `pose_prior.KINDS`, and speeds (n,), spines/s.
     """
-    kinds = np.empty(n, np.int64)
-    speed = np.empty(n)
+    kinds, speed = np.empty(n, np.int64), np.empty(n)
+    cards = [kind for kind, (number, *_) in _STRETCHES.items() for _ in range(number)]
     deck: list[int] = []
     at = 0
     while at < n:
-        if not deck:  # used up before it is shuffled again, so that no kind is absent for long
-            cards = np.repeat(range(len(KINDS)), [_STRETCHES[k][0] for k in range(len(KINDS))])
-            deck = rng.permutation(cards).tolist()
+        # used up before it is shuffled again, so that no kind is absent for long
+        deck = deck or rng.permutation(cards).tolist()
         kind = deck.pop()
-        _, shortest, longest, (slow, fast) = _STRETCHES[kind]
+        _, shortest, longest, speeds = _STRETCHES[kind]
         stop = at + int(_RATE_HZ * rng.uniform(shortest, longest))
-        kinds[at:stop] = kind
-        speed[at:stop] = rng.uniform(slow, fast)
+        kinds[at:stop], speed[at:stop] = kind, rng.uniform(*speeds)
         at = stop
     return kinds, np.maximum(smoothed(speed, _BLEND_S * _RATE_HZ), 0.0)
 
@@ -166,17 +153,21 @@ def free_path(
     start = np.array([*(home + rng.normal(0.0, 0.2 * margin, 2)), 0.0])
     azimuth = rng.uniform(-np.pi, np.pi)
     rate = lfilter([1.0], [1.0, -0.93], rng.normal(0.0, 0.25, len(speed)))
-
-    def turn(i: int, close: float, away: float) -> float:
-        pace = min(speed[i] / spine_mm, 1.0)
-        # it turns back faster at higher speed, within a mouse's turning rate
-        pull = 6.0 * close * away * pace
-        return float(np.clip(rate[i] * (0.2 + pace) + pull, -7.0, 7.0) / _RATE_HZ)
-
-    run = speed / _RATE_HZ
-    level = np.zeros(len(speed))
+    pace = np.minimum(speed / spine_mm, 1.0)
     position, heading = _steered(
-        scene, home, start, azimuth, spine_mm, margin, run, level, (0.0, 0.0), turn
+        scene,
+        home,
+        start,
+        azimuth,
+        spine_mm,
+        margin,
+        speed / _RATE_HZ,
+        np.zeros(len(speed)),
+        (0.0, 0.0),
+        # it turns back faster at higher speed, within a mouse's turning rate
+        lambda i, close, away: (
+            np.clip(rate[i] * (0.2 + pace[i]) + 6.0 * close * away * pace[i], -7.0, 7.0) / _RATE_HZ
+        ),
     )
     return position[:, :2], heading
 
@@ -211,8 +202,7 @@ def _steered(
     Returns:
         Positions (n, 3) mm, arena frame, and headings (n,) rad.
     """
-    position = np.empty((len(run), 3))
-    heading = np.empty(len(run))
+    position, heading = np.empty((len(run), 3)), np.empty(len(run))
     xy, z = start[:2], float(start[2])
     for i in range(len(run)):
         back = np.arctan2(home[1] - xy[1], home[0] - xy[0])
@@ -225,8 +215,7 @@ def _steered(
         if there > margin or there > here:
             xy = xy + step
         z = float(np.clip(z + run[i] * np.sin(pitch[i]), *heights))
-        position[i] = [*xy, z]
-        heading[i] = azimuth
+        position[i], heading[i] = [*xy, z], azimuth
     return position, heading
 
 
@@ -278,19 +267,16 @@ def _swim_script(
     In body lengths/s, rad/s, degrees per joint and rad.
     """
     speed, turning, amplitude, rate = np.zeros((4, n))
-    at = 0
-    pace = 0.0
+    at, pace = 0, 0.0
     while at < n:
-        reached = rng.uniform(*_BOUT_SPEED)
+        pace = max(rng.uniform(*_BOUT_SPEED), pace)
         beats = rng.uniform(4.0, 9.0)
         beating, resting = (
             max(2, int(rng.uniform(*span) / step_s)) for span in ((0.15, 0.6), (0.1, 1.2))
         )
         stop = min(at + beating, n)
-        pace = max(reached, pace)
-        speed[at:stop] = pace
+        speed[at:stop], rate[at:stop] = pace, beats
         amplitude[at:stop] = rng.uniform(1.5, 5.0) * np.sqrt(pace / _BOUT_SPEED[1])
-        rate[at:stop] = beats
         # share of bouts that begin with a turn
         if rng.random() < 0.35:
             brief = min(at + max(2, int(0.14 / step_s)), n)
@@ -342,13 +328,18 @@ def wander(
     z = rng.uniform(*water)
     home = (T.translation + ray * (T.translation[2] - z) / -ray[2])[:2]
     start = np.array([*(home + rng.normal(0.0, 0.1 * length, 2)), z])
-    azimuth = rng.uniform(-np.pi, np.pi)
-
-    def turn(i: int, close: float, away: float) -> float:
-        return float((turning[i] + 8.0 * close * away) * step_s)
-
-    run = speed * length * step_s
-    return _steered(scene, home, start, azimuth, length, 0.6 * length, run, pitch, water, turn)
+    return _steered(
+        scene,
+        home,
+        start,
+        rng.uniform(-np.pi, np.pi),
+        length,
+        0.6 * length,
+        speed * length * step_s,
+        pitch,
+        water,
+        lambda i, close, away: (turning[i] + 8.0 * close * away) * step_s,
+    )
 
 
 def waver(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
@@ -356,20 +347,18 @@ def waver(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     return 4.0 * smoothed(rng.normal(0.0, 0.05, shape), _BLEND_S * _RATE_HZ)
 
 
-def smoothed(rows: Array, frames: float) -> Array:
-    """Columns, or one, convolved with a Gaussian kernel, with the end values extended.
+def smoothed(rows: Array, frames: float, deviations: float = 4.0) -> Array:
+    """Samples convolved with a Gaussian kernel, with the end values extended.
 
     Args:
-        rows: (n, k) samples.
+        rows: (n, ...) samples.
         frames: standard deviation of the kernel, in samples.
+        deviations: the kernel's reach, in standard deviations.
 
     Returns:
-        (n, k).
+        (n, ...).
     """
-    if rows.ndim == 1:
-        return smoothed(rows[:, None], frames)[:, 0]
-    reach = int(4 * frames)
+    reach = int(deviations * frames)
     bell = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
-    bell /= bell.sum()
-    padded = np.pad(rows, ((reach, reach), (0, 0)), mode="edge")
-    return np.stack([np.convolve(column, bell, mode="valid") for column in padded.T], axis=-1)
+    padded = np.pad(rows, [(reach, reach)] + [(0, 0)] * (rows.ndim - 1), mode="edge")
+    return np.apply_along_axis(np.convolve, 0, padded, bell / bell.sum(), mode="valid")

@@ -96,11 +96,8 @@ def draw_postures(
     n_bones = skeleton.n_joints - 1
     bones = np.linalg.norm(skeleton.offsets[1:], axis=1)
     rest = resting_heights(skeleton, shape)
-
-    def is_kind(name: str) -> NDArray[np.bool_]:
-        """Mask (n, 1) of the postures of a kind, a word of `KINDS`."""
-        return (kinds == KINDS.index(name))[:, None]
-
+    # masks (n, 1) of the postures of each kind
+    _, curled, reared, hunched, reaching = (kinds[:, None] == k for k in range(len(KINDS)))
     # walking: the mid-axis is at half the body's thickness, slightly higher in front; the nose is
     # low
     height = rest + np.linspace(0.5, 4.0, n_bones + 1) * rng.random((n, n_bones + 1))
@@ -117,12 +114,10 @@ def draw_postures(
     reach = low.copy()
     reach[:, -1] = np.radians(rng.uniform(-40.0, 40.0, n))
     reach[:, -2] += np.radians(rng.uniform(-10.0, 25.0, n))
-    elevation = np.select(
-        [is_kind("rear"), is_kind("hunch"), is_kind("reach")], [tower, arch, reach], low
-    )
+    elevation = np.select([reared, hunched, reaching], [tower, arch, reach], low)
     return Posture(
         elevation,
-        _draw_turns(rng, skeleton, is_kind("curl") | (rng.random((n, 1)) < 0.1), is_kind("reach")),
+        _draw_turns(rng, skeleton, curled | (rng.random((n, 1)) < 0.1), reaching),
         np.clip(rng.normal(0.0, np.radians(5.0), n), -np.radians(15.0), np.radians(15.0)),
         rng.uniform(*STRETCH, n),
     )
@@ -166,9 +161,16 @@ def resting_heights(skeleton: Skeleton, shape: BodyShape) -> Array:
 
 
 def stand(
-    skeleton: Skeleton, posture: Posture, heading: Array, size: Array, shape: BodyShape, gap: Array
+    skeleton: Skeleton,
+    posture: Posture,
+    heading: Array,
+    size: Array,
+    shape: BodyShape,
+    gap: Array,
+    middle: Array | None = None,
+    n_middle: int | None = None,
 ) -> tuple[Pose, Array]:
-    """Place postures on the floor z = 0, rump above the origin.
+    """Place postures on the floor z = 0.
 
     The rear part of the trunk is `gap` above the floor; if the front would be below it, the whole
     animal is tilted up around the rump, in at most six iterations.
@@ -180,6 +182,8 @@ def stand(
         size: (n,) of the animals over home size.
         shape: (n) their bodies.
         gap: (n,) between the floor and the lowest point of the rear, mm.
+        middle: (n, 2) mean of the joints in the floor, mm; None puts the rump above the origin.
+        n_middle: number of joints, from the rump on, whose mean is at `middle`; None is all.
 
     Returns:
         Poses (n) in the arena frame, their angles clipped to the joints' limits, and girths (n,).
@@ -195,7 +199,6 @@ def stand(
     elevation = posture.elevation[:, 0].copy()
     # the rear part of the trunk supports a reared animal
     rear = stations <= 0.35
-    pose = Pose.home(skeleton, len(size))
     for _ in range(6):
         rotation = root_rotation(heading, elevation, posture.roll)
         pose = Pose(SE3(rotation, np.zeros((len(size), 3))), angles, scale)
@@ -221,6 +224,9 @@ def stand(
         )
     sunk = np.maximum(-(lowest.min(axis=1) + height), 0.0)
     pose.root.translation[:, 2] = height + sunk
+    if middle is not None:
+        off = middle - pose.joints(skeleton)[:, :n_middle, :2].mean(axis=1)
+        pose.root.translation[:, :2] += off
     return pose, girth
 
 

@@ -28,23 +28,61 @@ from liex_lab.simulation._sensor_kernels import ANIMAL, UNIT
 from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.rendering import Solid, Views
 from liex_lab.simulation.scene import OBJECT_FACES, SimulatedScene, draw_object
+from liex_lab.simulation.sensors import Sensor
 
 Array = NDArray[np.float64]
 
 FRAME_NS = 33_333_333
 OTHER_CAMERA = "other-camera"  # focal lengths and resolutions not used in training
-Split = tuple[int, str, float, int, float]
-# name: (own seed, shape family, noise, eroded pixels, share of frames with another object in view)
+Split = tuple[int, Mapping[str, Any]]
+# name: (own seed, settings, see `Take`)
 SPLITS: Mapping[str, Split] = {
-    "clean": (71_001, "train", 1.0, 0, 0.0),
-    "hard": (72_001, "train", 2.0, 1, 0.5),
-    "other-body": (74_001, "other", 1.0, 0, 0.0),
-    OTHER_CAMERA: (75_001, "train", 1.0, 0, 0.0),
+    "clean": (71_001, {}),
+    "hard": (72_001, {"noise": 2.0, "erosion_px": 1, "object_share": 0.5}),
+    "other-body": (74_001, {"family": "other"}),
+    OTHER_CAMERA: (75_001, {}),
 }
 # held-out recordings, not used in tests, training or development: evaluated once per release. They
 # are like the splits above in turn, each with its own seed
 SEALED = "sealed"
 SEALED_SEED = 970_413
+
+
+@dataclass(frozen=True)
+class Take:
+    """Settings of a recording of animals before one camera.
+
+    Attributes:
+        n_frames: its length, at the species' rate.
+        sensor: the camera's make.
+        moving: whether the animal moves; else postures and places are independent.
+        family: of body shapes, see `body.variation`.
+        noise: multiplies the sensor's random errors and its rate of holes.
+        erosion_px: pixels of the image stripped off the animal's outline.
+        object_share: share of frames with a distractor.
+        spine_mm: length of the animals, mm; None draws it.
+        name: of the recording; '' names it after the animal.
+    """
+
+    n_frames: int
+    sensor: Sensor
+    moving: bool = False
+    family: str = "train"
+    noise: float = 1.0
+    erosion_px: int = 0
+    object_share: float = 0.0
+    spine_mm: float | None = None
+    name: str = ""
+
+    def parameters(self, rng: np.random.Generator, fur: Array) -> Array:
+        """Parameters of a unit of the sensor in each frame, (n_frames, N_PARAMETERS).
+
+        Args:
+            rng: random number generator.
+            fur: (1,) of the animal, from 0 to 1.
+        """
+        unit = self.sensor.draw(rng, 1, fur, self.noise, self.erosion_px * self.sensor.stride)
+        return np.repeat(unit, self.n_frames, axis=0)
 
 
 @dataclass(frozen=True)
@@ -114,7 +152,7 @@ class Stage(Rows):
         parameters: (n, N_PARAMETERS) of the sensor.
         seeds: (n,) uint64, of its noise.
         times_ns: (n,) int64 time stamps, ns.
-        stills: (E, H, W) float32 mm, further still scenes, 0 = nothing; None is the scene's own.
+        stills: (E, H, W) float32 mm, ideal depth of still scenes, 0 for nothing.
         epoch: (n,) int64, the still scene of each frame.
         ground: (n, N_GROUND) a background to ray-cast instead.
         offset_mm: (n,) error added to the sensor's depth, mm.
@@ -128,8 +166,8 @@ class Stage(Rows):
     parameters: Array
     seeds: NDArray[np.uint64]
     times_ns: NDArray[np.int64]
-    stills: NDArray[np.float32] | None = None
-    epoch: NDArray[np.int64] | None = None
+    stills: NDArray[np.float32]
+    epoch: NDArray[np.int64]
     ground: Array | None = None
     offset_mm: Array | None = None
 
@@ -144,21 +182,12 @@ class Stage(Rows):
         """All meshes."""
         return [*(solid for actor in self.actors for solid in actor.solids), *self.objects]
 
-    def still(self, index: int) -> NDArray[np.float32]:
-        """Ideal depth (H, W) mm of the still scene in a frame, 0 for nothing."""
-        if self.stills is None or self.epoch is None:
-            return self.scene.still
-        return np.asarray(self.stills[self.epoch[index]])
-
     def depths(self) -> NDArray[np.float32]:
         """Depth images (n, H, W) mm of all frames, 0 if unread."""
         n = len(self.seeds)
         c = self.scene.camera
-        still = None
         ground = np.zeros((n, N_GROUND)) if self.ground is None else self.ground
-        if self.ground is None:
-            stills = self.scene.still[None] if self.stills is None else self.stills
-            still = stills, np.zeros(n, np.int64) if self.epoch is None else self.epoch
+        still = (self.stills, self.epoch) if self.ground is None else None
         views = Views.of(c, self.scene.T_arena_camera, self.parameters, ground)
         origin = np.zeros((n, 2), np.int64)
         out, _ = views.render(self.solids, self.seeds, origin, (c.height, c.width), still)
@@ -235,11 +264,10 @@ class RenderedRecording(Recording):
 
     def _truth(self, actor: Actor) -> TrueAnimal:
         joints = self._sides * (self.T_arena_camera.inverse() @ actor.joints)
-        joints[~actor.present] = np.nan
+        there = actor.present
         share = np.zeros(len(self))
-        rows = np.flatnonzero(actor.present)
-        share[rows] = self.visible(actor, rows)
-        return TrueAnimal(actor.spine_mm, joints, share)
+        share[there] = self.visible(actor, np.flatnonzero(there))
+        return TrueAnimal(actor.spine_mm, np.where(there[:, None, None], joints, np.nan), share)
 
     def visible(self, actor: Actor, rows: NDArray[np.int64]) -> Array:
         """Share of an animal's body that is inside the image and not occluded.
@@ -256,8 +284,8 @@ class RenderedRecording(Recording):
         left, top = c.width // 4, c.height // 4
         around = (-left, -top, c.width + 2 * left, c.height + 2 * top)
         own, *parts = actor.solids
-        others = [one.solids for one in self.stage.actors if one is not actor]
-        before = [*parts, *self.stage.objects, *(solid for solids in others for solid in solids)]
+        others = [one for one in self.stage.actors if one is not actor]
+        before = [*parts, *self.stage.objects, *(part for one in others for part in one.solids)]
         share = np.empty(len(rows))
         for k, i in enumerate(rows):
             whole = render_mesh(own[i : i + 1].vertices()[0], own.faces, c, around, T)
@@ -268,7 +296,7 @@ class RenderedRecording(Recording):
                 if solid.moment[i] >= 0
             ]
             if self.stage.ground is None:
-                depths.append(self.stage.still(i))
+                depths.append(self.stage.stills[self.stage.epoch[i]])
             clear = mine > 0
             for depth in depths:
                 clear &= (depth == 0) | (mine < depth + 2.0)
@@ -321,9 +349,8 @@ def distractor(
     kind: str,
     trunk: Array,
     spine_mm: float,
-    share: float,
     scale: float,
-    stride: int,
+    take: Take,
 ) -> Solid:
     """One object for a recording, at a free position of its own in a share of the frames.
 
@@ -333,14 +360,13 @@ def distractor(
         kind: of object, see `draw_object`.
         trunk: (n, V, 3) vertices of the animal, mm, arena frame.
         spine_mm: length of the animal, mm.
-        share: of frames with an object.
         scale: of the surroundings, see `SceneSpec`.
-        stride: only every `stride`-th pixel is read.
+        take: the sensor and the share of frames with an object.
     """
     mesh = draw_object(rng, kind, spine_mm)
     n = len(trunk)
     shift = np.zeros((n, 3))
-    shown = rng.random(n) < share
+    shown = rng.random(n) < take.object_share
     reach = 1.1 * scene.half
     for i in np.flatnonzero(shown):
         own = trunk[i, ::3, :2]
@@ -349,20 +375,20 @@ def distractor(
             gap = np.linalg.norm((mesh[::3, None] + shift[i])[..., :2] - own, axis=-1).min()
             # a hand reaches over the wall; other objects are inside
             within = mesh[:, 2].max() > 0.6 * spine_mm or scene.wall_clearance(shift[i, :2]) > 0
-            free = bool(gap > 8.0 * scale and within)
-            if free and not _covers(scene, mesh + shift[i], trunk[i], 4.0 * stride):
+            apart = gap > 8.0 * scale and within
+            if apart and not _covers(scene, mesh + shift[i], trunk[i], 4.0 * take.sensor.stride):
                 break
         else:
             shown[i] = False
-    moment = np.where(shown, np.arange(n), -1)
-    return Solid(OBJECT_FACES, moment, lambda rows: mesh + shift[rows, None])
+    return Solid(
+        OBJECT_FACES, np.where(shown, np.arange(n), -1), lambda rows: mesh + shift[rows, None]
+    )
 
 
 def _covers(scene: SimulatedScene, item: Array, trunk: Array, margin_px: float) -> bool:
     """Whether the distractor and the animal overlap in the image, or nearly so."""
     T_camera_arena = scene.T_arena_camera.inverse()
-    a = scene.camera.project(T_camera_arena @ item)
-    b = scene.camera.project(T_camera_arena @ trunk)
+    a, b = (scene.camera.project(T_camera_arena @ points) for points in (item, trunk))
     gap = np.linalg.norm(a[::3, None] - b[None, ::3], axis=-1).min()
     middle = b.mean(axis=0)
     around = (a.min(axis=0) < middle).all() and (a.max(axis=0) > middle).all()

@@ -84,11 +84,10 @@ class Views(Rows):
     def of(camera: Camera, T_arena_camera: SE3, parameters: Array, ground: Array) -> Views:
         """One camera n times."""
         n = len(parameters)
-        size = np.array([camera.width, camera.height])
-        T = T_arena_camera[None][np.zeros(n, np.int64)]
         intrinsics = np.tile(camera.intrinsics, (n, 1))
-        flat = np.zeros((n, 3))
-        return Views(intrinsics, np.tile(size, (n, 1)), T, parameters, ground, flat)
+        size_px = np.tile(np.array([camera.width, camera.height]), (n, 1))
+        T = T_arena_camera[None][np.zeros(n, np.int64)]
+        return Views(intrinsics, size_px, T, parameters, ground, np.zeros((n, 3)))
 
     def around(
         self, bodies: Array, window_px: int, shift: Array | float = 0.5

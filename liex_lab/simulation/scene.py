@@ -142,8 +142,7 @@ def _hand(rng: np.random.Generator, spine_mm: float) -> Parts:
     lift = rng.uniform(0, 50)
     size = rng.uniform(0.8, 1.1)
     pointing = rng.uniform(-np.pi, np.pi)
-    palm = ([0.0, 0.0, lift + 16], size * np.array([42.0, 38.0, 15.0]), pointing, 3.0)
-    parts: Parts = [palm]
+    parts: Parts = [([0.0, 0.0, lift + 16], size * np.array([42.0, 38.0, 15.0]), pointing, 3.0)]
     for k in range(1, 6):
         fan = pointing + (k - 3) * 0.28
         reach = size * (70.0 if k < 5 else 55.0)
@@ -166,7 +165,7 @@ def draw_object(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
     Returns:
         (N_PARTS * V, 3) mm, arena frame, with triangles as in `OBJECT_FACES`.
     """
-    draw = {
+    parts = {
         "block": _block,
         "ball": _ball,
         "pellet": _pellet,
@@ -174,8 +173,8 @@ def draw_object(rng: np.random.Generator, kind: str, spine_mm: float) -> Array:
         "fish": _fish,
         "cable": _cable,
         "hand": _hand,
-    }[kind]
-    return mesh_of(draw(rng, spine_mm))
+    }[kind](rng, spine_mm)
+    return mesh_of(parts)
 
 
 ROUND = "round"
@@ -265,30 +264,21 @@ class SimulatedScene:
         middle = np.array([(camera.width - 1) / 2.0, (camera.height - 1) / 2.0])
         centre = floor_point(camera, T_arena_camera, middle) + rng.uniform(-0.15, 0.15, 2) * half
         low, high = setting.walls_mm
-        yaw = float(rng.uniform(-0.3, 0.3))
-        wall_mm = float(rng.uniform(low, min(high, 0.7 * height)))
-        if rng.random() < setting.open_share:
-            wall_mm = 0.0  # an open table
+        yaw = rng.uniform(-0.3, 0.3)
+        wall_mm = rng.uniform(low, min(high, 0.7 * height))
+        wall_mm *= rng.random() >= setting.open_share  # else an open table
         scene = SimulatedScene(camera, T_arena_camera, kind, centre, half, yaw, wall_mm)
-        return scene._furnished(rng, spine_mm, setting)
-
-    def _furnished(
-        self, rng: np.random.Generator, spine_mm: float, setting: SceneSpec
-    ) -> "SimulatedScene":
-        """The scene with its depth image, and in a third of cases with one or two objects."""
-        still = self._ideal_depth(rng, setting.scale)
-        T_camera_arena = self.T_arena_camera.inverse()
-        outline = []
+        still = scene._ideal_depth(rng, setting.scale)
+        outline = [np.zeros((0, 2))]
         for _ in range(rng.choice([0, 1, 2], p=[0.65, 0.25, 0.10])):
             mesh = draw_object(rng, str(rng.choice(setting.clutter)), 0.8 * spine_mm)
             azimuth = rng.uniform(-np.pi, np.pi)
-            local = 0.8 * self.half * [np.cos(azimuth), np.sin(azimuth)]
-            mesh[:, :2] += self.centre + turned(local, self.yaw)
-            item = render_mesh(mesh, OBJECT_FACES, self.camera, T_camera_mesh=T_camera_arena)
+            local = 0.8 * half * [np.cos(azimuth), np.sin(azimuth)]
+            mesh[:, :2] += centre + turned(local, yaw)
+            item = render_mesh(mesh, OBJECT_FACES, camera, T_camera_mesh=T_arena_camera.inverse())
             still = np.where((item > 0) & ((still == 0) | (item < still)), item, still)
             outline.append(mesh[:, :2])
-        clutter = np.concatenate(outline) if outline else np.zeros((0, 2))
-        return replace(self, clutter=clutter, still=still)
+        return replace(scene, clutter=np.concatenate(outline), still=still)
 
     def wall_clearance(self, xy: Array) -> Array:
         """Signed distance of floor points from the walls, mm; negative outside.
@@ -329,20 +319,16 @@ class SimulatedScene:
         The floor continues beyond an open table; beyond walls there is nothing, or in 40 % of the
         scenes the cluttered surroundings of the arena.
         """
-        T = self.T_arena_camera
-        camera = self.camera
-        u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-        d = camera.unproject(np.stack([u, v], axis=-1), np.ones(u.shape)) @ T.rotation.T
+        T, camera = self.T_arena_camera, self.camera
+        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1)
+        d = camera.unproject(pixels, 1.0) @ T.rotation.T
         height = T.translation[2]
         fall = np.where(d[..., 2] < -1e-3, -d[..., 2], 1e-3)
         floor = height / fall
         ground = floor[..., None] * d[..., :2]
         raised = unevenness(rng, ground, scale)
         wall_clearance = self.wall_clearance(ground)
-        # multi-path reflections fill the corner between floor and wall
-        corner = rng.uniform(0.0, 12.0) * scale
-        spread = rng.uniform(6.0, 25.0) * scale
-        raised += corner * np.exp(-np.maximum(wall_clearance, 0.0) / spread) * (self.wall_mm > 0)
+        raised += rounding(rng, wall_clearance, 12.0, 25.0, scale) * (self.wall_mm > 0)
         inside = (wall_clearance > 0) & (d[..., 2] < -1e-3)
         depth = np.where(inside, floor - raised / fall, 0.0)
         wall = self._wall_distance(d)
@@ -363,15 +349,10 @@ class SimulatedScene:
         start = turned(-self.centre, -self.yaw)
         d = turned(direction[..., :2], -self.yaw)
         if self.kind == ROUND:
-            a = np.sum(d * d, axis=-1)
-            b = d @ start
-            c = start @ start - self.half[0] ** 2
-            root = b * b - a * c
-            return np.where(
-                (root > 0) & (a > 1e-12),
-                (-b + np.sqrt(np.maximum(root, 0))) / np.maximum(a, 1e-12),
-                0.0,
-            )
+            a, b = np.sum(d * d, axis=-1), d @ start
+            root = b * b - a * (start @ start - self.half[0] ** 2)
+            far = (-b + np.sqrt(np.maximum(root, 0))) / np.maximum(a, 1e-12)
+            return np.where((root > 0) & (a > 1e-12), far, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             leave = (np.sign(d) * self.half - start) / d
         return np.maximum(np.nanmin(np.where(np.isfinite(leave), leave, np.inf), axis=-1), 0.0)
@@ -512,3 +493,22 @@ def unevenness(
             * np.sin(2 * np.pi * along / length + rng.uniform(0, 2 * np.pi))
         )
     return waves
+
+
+def rounding(
+    rng: np.random.Generator, clearance: Array, deep: float, far: float, scale: float = 1.0
+) -> Array:
+    """Heights that multi-path reflections add to a floor at the foot of walls.
+
+    Args:
+        rng: random number generator.
+        clearance: (...) distance from the walls, mm.
+        deep: largest height at their foot, mm at scale 1.
+        far: largest extent, mm at scale 1.
+        scale: of the surroundings, see `SceneSpec`.
+
+    Returns:
+        (...) mm.
+    """
+    height = rng.uniform(0.0, deep) * scale
+    return height * np.exp(-np.maximum(clearance, 0.0) / (rng.uniform(6.0, far) * scale))

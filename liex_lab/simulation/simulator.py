@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Final
 from urllib.parse import parse_qsl
@@ -35,11 +36,10 @@ def world_of(skeleton: Skeleton) -> Species:
     Returns:
         The species; the hand uses labelled test postures if `find_reference` finds any.
     """
-    if skeleton.name == "hand":
-        return HandSpecies(skeleton, reference=find_reference())
     known: dict[str, Callable[[Skeleton], Species]] = {
         "mouse": MouseSpecies,
         "fish": FishSpecies,
+        "hand": lambda hand: HandSpecies(hand, reference=find_reference()),
     }
     return known.get(skeleton.name, GenericSpecies.of)(skeleton)
 
@@ -47,10 +47,10 @@ def world_of(skeleton: Skeleton) -> Species:
 # Benchmark sequences for tracking: one moving animal, clean or corrupted, with exact truth.
 
 
-# frames, as in the paper; own seed; noise; eroded pixels; whether there are corruptions
-SEQUENCES = {
-    "easy": (511, 75_001, 1.0, 0, False),
-    "hard": (300, 76_001, 2.0, 1, True),
+# frames, as in the paper; own seed; settings, see `Take`; whether there are corruptions
+SEQUENCES: Mapping[str, tuple[int, int, Mapping[str, Any], bool]] = {
+    "easy": (511, 75_001, {}, False),
+    "hard": (300, 76_001, {"noise": 2.0, "erosion_px": 1}, True),
 }
 
 
@@ -85,8 +85,7 @@ def tracking_sequence(
     """
     if name not in SEQUENCES:
         raise RecordingError(f"there is no sequence '{name}'; known are {', '.join(SEQUENCES)}")
-    sensor = sensor or world.sensors[0]
-    usual_frames, usual_seed, noise, erosion_px, corrupted = SEQUENCES[name]
+    usual_frames, usual_seed, settings, corrupted = SEQUENCES[name]
     n = n_frames or usual_frames
     own_seed = [usual_seed if seed is None else seed]
     rng = np.random.default_rng([*own_seed, 1])
@@ -100,10 +99,9 @@ def tracking_sequence(
     base = world.motion(
         own_seed,
         int(rows[-1]) + 1,
-        sensor=sensor,
-        noise=noise,
-        erosion_px=erosion_px * sensor.stride,
+        sensor=sensor or world.sensors[0],
         spine_mm=spine_mm,
+        **settings,
     )
     times = np.cumsum(np.concatenate([[0], steps[1:]])) * np.int64(world.frame_ns)
     joints, length = base.joints_camera[rows], base.spine_mm
@@ -183,11 +181,9 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             **_settings(kind, 1.0),
         }
         del settings["spine_mm"]
-        missing: dict[str, Any] = {"animal": "mouse", "body": 0, "seed": 0, "frames": 300}
-        session = ForeignRecording(**(missing | _values(address, stated, settings)))
+        session = ForeignRecording(**_values(address, stated, settings))
     else:
-        usual = "mouse" if kind in _SEQUENCES else ""
-        animal = _ANIMALS.get(kind) or stated.pop("animal", usual)
+        animal = _ANIMALS.get(kind) or stated.pop("animal", "mouse" if kind in _SEQUENCES else "")
         if not animal:
             raise RecordingError(
                 f"{address} lacks the animal that moves, as in "
@@ -201,8 +197,9 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
             session = tracking_sequence(world, _SEQUENCES[kind], **values)
         else:
             seed = values.pop("seed", 0)
-            n_frames = values.pop("frames", 300)
-            session = world.motion(seed, n_frames, name=f"synthetic-{kind}-{seed}", **values)
+            session = world.motion(
+                seed, values.pop("frames", 300), name=f"synthetic-{kind}-{seed}", **values
+            )
     if camera is not None:
         session.camera = fitting(
             camera, session.width, session.height, "the camera that was stated"
@@ -260,7 +257,7 @@ def _unsealed(
 
 def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting]) -> dict[str, Any]:
     """The values of an address's settings, validated against the settings of its kind."""
-    values = {}
+    values: dict[str, Any] = {}
     for key, text in stated.items():
         if key not in settings:
             near = difflib.get_close_matches(key, settings, 1, cutoff=0.0)[0]
@@ -268,11 +265,9 @@ def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting])
                 f"{address}: {key} is no setting of it; the nearest one is {near}, as in {_EXAMPLE}"
             )
         read, holds, expected = settings[key]
-        try:
+        with suppress(KeyError, ValueError):
             values[key] = read(text)
-        except (KeyError, ValueError):
-            values[key] = None
-        if values[key] is None or not holds(values[key]):
+        if key not in values or not holds(values[key]):
             raise RecordingError(
                 f"{address}: {key} is {expected}, got '{text}'; correct it, as in {_EXAMPLE}"
             )

@@ -47,6 +47,7 @@ from liex_lab.simulation.recording import (
     RenderedRecording,
     Split,
     Stage,
+    Take,
     distractor,
     split_of,
 )
@@ -80,6 +81,7 @@ class Species:
         splits: the test splits.
         sealed_seed: of the held-out split, see `recording.SEALED`.
         patch_px: side of training patches, px, enough for mice of up to 70 mm.
+        other_builds: whether errors of tracks are also calibrated on builds not used in training.
         sources: source of the training images.
     """
 
@@ -93,6 +95,7 @@ class Species:
     splits: ClassVar[Mapping[str, Split]] = SPLITS
     sealed_seed: ClassVar[int] = SEALED_SEED
     patch_px: ClassVar[int] = 144
+    other_builds: ClassVar[bool] = True
     sources: ClassVar[str] = "rendered from a seed; no recording of an animal was used"
 
     @property
@@ -189,21 +192,18 @@ class Species:
         recordings = []
         for k in range(n_sessions):
             kind = split_of(name, k)
-            seed, family, noise, erosion_px, object_share = self.splits[kind]
+            seed, settings = self.splits[kind]
             sensors = self.other_sensors if kind == OTHER_CAMERA else self.sensors
             turn = k // len(self.splits) if name == SEALED else k
-            sensor = sensors[turn % len(sensors)]
-            recording = self.film(
-                [self.sealed_seed if name == SEALED else seed, k],
-                sensor=sensor,
-                family=family,
-                noise=noise,
-                erosion_px=erosion_px * sensor.stride,
-                object_share=object_share,
-                spine_mm=spine_mm,
-                name=f"{name}-{k:02d}",
+            recordings.append(
+                self.film(
+                    [self.sealed_seed if name == SEALED else seed, k],
+                    sensor=sensors[turn % len(sensors)],
+                    spine_mm=spine_mm,
+                    name=f"{name}-{k:02d}",
+                    **settings,
+                )
             )
-            recordings.append(recording)
         return recordings
 
     def motion(self, seed: int | list[int], n_frames: int, **settings: Any) -> RenderedRecording:
@@ -215,56 +215,32 @@ class Species:
         seed: int | list[int],
         n_frames: int = 50,
         *,
-        moving: bool = False,
         sensor: Sensor | None = None,
-        family: str = "train",
-        noise: float = 1.0,
-        erosion_px: int = 0,
-        object_share: float = 0.0,
-        spine_mm: float | None = None,
-        name: str = "",
+        **settings: Any,
     ) -> RenderedRecording:
         """A recording of one animal before one camera.
 
         Args:
             seed: seed or seeds of all random numbers.
             n_frames: length of the recording, at the species' rate.
-            moving: whether the animal moves; else postures and places are independent.
             sensor: the camera's make; None is the species' last.
-            family: of body shapes, see `body.variation`.
-            noise: multiplies the sensor's random errors and its rate of holes.
-            erosion_px: pixels stripped off the animal's outline.
-            object_share: share of frames with a distractor.
-            spine_mm: length of the animal, mm; None draws it.
-            name: of the recording; '' names it after the animal.
+            **settings: the other attributes of `Take`.
 
         Returns:
             The recording with its truth.
         """
         rng = np.random.default_rng(seed)
-        sensor = sensor or self.sensors[-1]
-        length = float(spine_mm or self.skeleton.length * rng.uniform(*self.sizes))
-        stage = self._stage(
-            rng, sensor, length, n_frames, moving, family, noise, erosion_px, object_share
-        )
-        return RenderedRecording(name or f"synthetic-{self.skeleton.name}", stage)
+        take = Take(n_frames, sensor or self.sensors[-1], **settings)
+        length = float(take.spine_mm or self.skeleton.length * rng.uniform(*self.sizes))
+        title = take.name or f"synthetic-{self.skeleton.name}"
+        return RenderedRecording(title, self._stage(rng, take, length))
 
-    def _stage(
-        self,
-        rng: np.random.Generator,
-        sensor: Sensor,
-        length: float,
-        n: int,
-        moving: bool,
-        family: str,
-        noise: float,
-        erosion_px: int,
-        object_share: float,
-    ) -> Stage:
+    def _stage(self, rng: np.random.Generator, take: Take, length: float) -> Stage:
         """Everything before the camera in `film`, of an animal of a given length, mm."""
-        scene = SimulatedScene.draw(rng, sensor.camera, length, self.setting)
-        shape = self.shapes(rng, family, 1)
-        if moving:
+        n = take.n_frames
+        scene = SimulatedScene.draw(rng, take.sensor.camera, length, self.setting)
+        shape = self.shapes(rng, take.family, 1)
+        if take.moving:
             pose, girth = self.move(rng, scene, shape, length, n)
         else:
             size = np.full(n, length / self.skeleton.length)
@@ -273,17 +249,16 @@ class Species:
         surface = Surface.of(self.skeleton)
         bends = self.bends(rng, n)
         trunk = surface.vertices(pose, shape[0], girth, bends)[:, : surface.n_trunk_vertices]
-        if not moving:
+        if not take.moving:
             bottoms = trunk[..., 2].min(axis=1) if self.floats else None
             shift = scene.places(rng, outline_of(trunk), trunk[..., 2].max(axis=1), bottoms)
             pose.root.translation[:, :2] += shift
             trunk[..., :2] += shift[:, None]
         kind = str(rng.choice(self.objects))
-        scale = self.setting.scale
-        item = distractor(rng, scene, kind, trunk, length, object_share, scale, sensor.stride)
-        parameters = sensor.draw(rng, 1, shape.fur, noise, erosion_px)
+        item = distractor(rng, scene, kind, trunk, length, self.setting.scale, take)
+        parameters = take.parameters(rng, shape.fur)
         seeds = rng.integers(1, 2**63, n).astype(np.uint64)
-        if moving and bends is not None:
+        if take.moving and bends is not None:
             bends = bends[:1] + waver(rng, bends.shape)
         actor = Actor(surface, length, shape, pose, girth, bends, np.ones(n, np.bool_))
         return Stage(
@@ -291,9 +266,11 @@ class Species:
             self.skeleton,
             (actor,),
             (item,),
-            np.repeat(parameters, n, axis=0),
+            parameters,
             seeds,
             np.arange(n) * self.frame_ns,
+            scene.still[None],
+            np.zeros(n, np.int64),
         )
 
     def training_blocks(
@@ -354,10 +331,13 @@ class Species:
         training_patches.degrade(rng, parameters, degraded_share)
         T_arena_camera = draw_views(rng, m, self.setting)
         size = (nominal * rng.uniform(*self.sizes, m))[each]
-        rough = scale * rng.uniform(0.0, 1.0, m)
-        error = rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale]
         views = training_patches.floor_views(
-            intrinsics, size_px, T_arena_camera, parameters, error, rough
+            intrinsics,
+            size_px,
+            T_arena_camera,
+            parameters,
+            rough=scale * rng.uniform(0.0, 1.0, m),
+            error=rng.standard_normal((m, 3)) * [0.003, 0.003, 0.8 * scale],
         )[each]
         height = views.T_arena_camera.translation[:, 2]
         pose, girth = self.postures(rng, size, body[each], height)
@@ -564,7 +544,7 @@ class GenericSpecies(Species):
         slow = 0.5 / step_s
         starts = np.where(rng.random(n) < 1.0 / slow, np.arange(n), 0)
         drawn = draw_angles(rng, skeleton, n)[np.maximum.accumulate(starts)]
-        angles = smoothed(drawn.reshape(n, -1), 0.4 * slow).reshape(drawn.shape)
+        angles = smoothed(drawn, 0.4 * slow)
         speed = np.maximum(smoothed(rng.normal(0.4, 0.8, n), slow), 0.0)
         turning = smoothed(rng.normal(0.0, 3.0, n), slow)
         level = np.zeros(n)

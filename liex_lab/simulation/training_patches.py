@@ -175,11 +175,14 @@ def draw_walls(rng: np.random.Generator, trunk: Array, setting: SceneSpec, views
     )
     there = (rng.random(n) < 0.35) & (distance > 40.0 * scale)
     low, high = setting.walls_mm
-    height = rng.uniform(0.75 * low, high, n)
-    rounding = rng.uniform(0, 12, n)
-    spread = rng.uniform(6, 25, n)
-    distance = np.where(there, distance, 0.0)
-    put_walls(views, outward, distance, height, scale * rounding, scale * spread)
+    put_walls(
+        views,
+        outward,
+        np.where(there, distance, 0.0),
+        rng.uniform(0.75 * low, high, n),
+        scale * rng.uniform(0, 12, n),
+        scale * rng.uniform(6, 25, n),
+    )
 
 
 def put_walls(
@@ -203,6 +206,5 @@ def put_walls(
     normal = np.einsum("nji,nj->ni", views.T_arena_camera.rotation[:, :2], outward)
     apart = np.maximum(distance, 1.0)
     views.ground[:, kernels.WALL] = inverse_depth(normal, apart, views.intrinsics)
-    columns = (distance, height, rounding, reach)
-    for k, values in enumerate(columns, start=kernels.WALL_DISTANCE):
-        views.ground[:, k] = values
+    columns = np.broadcast_arrays(distance, height, rounding, reach)
+    views.ground[:, kernels.WALL_DISTANCE : kernels.WALL_DISTANCE + 4] = np.stack(columns, axis=1)

@@ -254,8 +254,7 @@ def _fish(scenario: Scenario, rng: np.random.Generator) -> Staged:
     pose = fish_acts.fish_poses(rng, species, motion, rows, fish.size)
     camera = agent.draw_camera(rng, species, species.sensors[0], shape.fur, height_mm, 4)
     girth, wall_mm = np.full(len(rows), fish.size), np.full(len(rows), np.nan)
-    views = camera[np.zeros(len(rows), np.int64)]
-    return motion, rows, pose, girth, species, views, shape, wall_mm
+    return motion, rows, pose, girth, species, camera[[0] * len(rows)], shape, wall_mm
 
 
 def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
@@ -277,13 +276,12 @@ def _mouse(scenario: Scenario, rng: np.random.Generator) -> Staged:
     # in some training recordings the walls are unknown
     if not scenario.novel and rng.random() >= 0.75:
         wall_mm = np.full(len(rows), np.nan)
-    views = camera[np.zeros(len(rows), np.int64)]
+    views = camera[[0] * len(rows)]
     # the wall nearest to the animal
     axis, each = np.argmin(half - np.abs(middle), axis=1), np.arange(len(rows))
     outward = np.zeros((len(rows), 2))
     outward[each, axis] = np.where(middle[each, axis] < 0, -1.0, 1.0)
-    height, rounding, reach = rng.uniform([100.0, 0.0, 6.0], [300.0, 8.0, 20.0])
-    put_walls(views, outward, half[axis], height, rounding, reach)
+    put_walls(views, outward, half[axis], *rng.uniform([100.0, 0.0, 6.0], [300.0, 8.0, 20.0]))
     return motion, rows, pose, girth, species, views, shape, wall_mm
 
 

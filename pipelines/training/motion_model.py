@@ -157,10 +157,10 @@ def other_builds(
         seeds: of the recordings.
 
     Returns:
-        One per seed; [] if the animal's simulator has one build only, like the hand's.
+        One per seed; [] if the species is not calibrated on other builds.
     """
     world = simulator.world_of(Skeleton.load(animal))
-    if world.skeleton.name == "hand":
+    if not world.other_builds:
         return []
     estimator = estimator_of(animal, "default", progress)
     plan = plan_of(animal)

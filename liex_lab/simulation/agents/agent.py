@@ -80,10 +80,26 @@ class Individual:
         factors = {
             name: float(np.exp(_TRAITS[name] * z)) for name, z in zip(_TRAITS, reach, strict=True)
         }
-        size = rng.uniform(*sizes)
-        restless = rng.random()
-        side = rng.uniform(-0.5, 0.5)
-        return Individual(size=float(size), **factors, restless=float(restless), side=float(side))
+        return Individual(
+            size=rng.uniform(*sizes),
+            **factors,
+            restless=rng.random(),
+            side=rng.uniform(-0.5, 0.5),
+        )
+
+    def duration(
+        self, rng: np.random.Generator, shortest: float, longest: float, least: float
+    ) -> float:
+        """Draw the duration of an action, s; most are near the shortest.
+
+        Args:
+            rng: random number generator.
+            shortest: of an animal of usual patience, s.
+            longest: of any, s.
+            least: of the most impatient, s.
+        """
+        usual = (longest - shortest) * rng.beta(1.3, 2.2)
+        return float(np.clip(shortest + usual * self.patience, least, longest))
 
     def turn_side(self, rng: np.random.Generator) -> float:
         """Draw a turning direction, left (1) or right (-1), by the preferred side.
@@ -130,7 +146,6 @@ class BehaviourSequence:
     Attributes:
         position: (3,) of the body's centre, mm, arena frame.
         heading: rad.
-        n_steps: steps of the clock so far.
     """
 
     def __init__(
@@ -161,7 +176,6 @@ class BehaviourSequence:
         self.heading = heading
         self._fits = fits
         self._actions: list[tuple[Array, Array, Array, str]] = []
-        self.n_steps = 0
 
     def play(self, word: str, draw: Callable[[], Array], tries: int = _TRIES) -> bool:
         """Add an action, redrawn until it leads only to possible positions.
@@ -175,7 +189,7 @@ class BehaviourSequence:
             False if no draw fits; the sequence is then unchanged.
         """
         for _ in range(tries):
-            channels, state = lfilter(*self._taps, wanted := draw(), axis=0, zi=self._state)
+            channels, state = lfilter(*self._taps, draw(), axis=0, zi=self._state)
             heading = self.heading + np.cumsum(channels[:, TURN]) * STEP_S
             run = channels[:, SPEED] * STEP_S
             climb = channels[:, CLIMB]
@@ -189,9 +203,25 @@ class BehaviourSequence:
                 self.position = position[-1]
                 self.heading = float(heading[-1])
                 self._actions.append((channels, heading, position, word))
-                self.n_steps += len(wanted)
                 return True
         return False
+
+    def words(
+        self, rng: np.random.Generator, shares: Mapping[str, float], seconds: float
+    ) -> Iterator[str]:
+        """Draw actions until the sequence has a minimum length.
+
+        Args:
+            rng: random number generator.
+            shares: relative frequencies of the actions, around which those of one animal vary.
+            seconds: minimum length, s.
+
+        Yields:
+            Names of actions to play.
+        """
+        own = np.array(list(shares.values())) * np.exp(rng.normal(0.0, 0.25, len(shares)))
+        while sum(len(channels) for channels, *_ in self._actions) * STEP_S < seconds:
+            yield str(rng.choice(list(shares), p=own / own.sum()))
 
     def nudge(self, position: Array) -> None:
         """Stop a cornered animal and move it slightly inside.
@@ -211,15 +241,12 @@ class BehaviourSequence:
         Returns:
             The motion on the 5 ms clock.
         """
-        lengths = [len(heading) for _, heading, _, _ in self._actions]
-        word = np.repeat([word for *_, word in self._actions], lengths)
-        act = np.repeat(np.arange(len(lengths)), lengths)
-        lag = min(self._lag, lengths[0] if lengths else 0)
-        late = np.maximum(np.arange(len(word)) - lag, 0)
-        channels, heading, position = (
-            np.concatenate([part[k] for part in self._actions]) for k in range(3)
-        )
-        return ActedMotion(channels, heading, position, word[late], act[late])
+        *parts, words = zip(*self._actions, strict=True)
+        lengths = [len(heading) for heading in parts[1]]
+        act = np.repeat(np.arange(len(words)), lengths)
+        late = np.maximum(np.arange(len(act)) - min(self._lag, lengths[0]), 0)
+        channels, heading, position = (np.concatenate(part) for part in parts)
+        return ActedMotion(channels, heading, position, np.array(words)[act[late]], act[late])
 
 
 def clock(seconds: float) -> Array:
@@ -232,12 +259,6 @@ def clock(seconds: float) -> Array:
         (m,) s, from 0 in steps of `STEP_S`.
     """
     return np.asarray(np.arange(max(2, round(seconds / STEP_S))) * STEP_S)
-
-
-def own_shares(rng: np.random.Generator, shares: Mapping[str, float]) -> tuple[list[str], Array]:
-    """The actions of one animal and their probabilities, which vary around given frequencies."""
-    share = np.array(list(shares.values())) * np.exp(rng.normal(0.0, 0.25, len(shares)))
-    return list(shares), share / share.sum()
 
 
 def bump(t: Array, length_s: float, peak: float = 0.5) -> Array:
@@ -341,20 +362,17 @@ def render_agent(
         Up to 256 patches: depth and background float32 mm with the camera's intrinsics and floor.
     """
     surface = Surface.of(species.skeleton)
-    n = len(girth)
-    seeds = rng.integers(1, 2**63, n).astype(np.uint64)
+    seeds = rng.integers(1, 2**63, len(girth)).astype(np.uint64)
     bends = species.bends(rng, 1)
-    for start in range(0, n, _BLOCK):
-        part = slice(start, min(start + _BLOCK, n))
-        one = np.zeros(part.stop - start, np.int64)
-        lying = None if bends is None else bends[one]
-        vertices = surface.vertices(pose[part], shape[one], girth[part], lying)
-        body = Solid.of(vertices, surface.faces, label=ANIMAL)
+    unit = np.float32(views.parameters[0, UNIT])
+    for start in range(0, len(girth), _BLOCK):
+        part = slice(start, start + _BLOCK)
         some = views[part]
+        vertices = surface.vertices(pose[part], shape[0], girth[part], bends)
+        body = Solid.of(vertices, surface.faces, label=ANIMAL)
         origin = some.around(vertices[:, : surface.n_trunk_vertices], window_px)
         size = (window_px, window_px)
         depth, background = some.render([body], seeds[part], origin, size, learn=True)
-        unit = np.float32(some.parameters[0, UNIT])
         yield Patches(
             depth * unit,
             background * unit,

@@ -18,7 +18,6 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.simulation.agents.agent import (
     CLIMB,
-    SPEED,
     STEP_S,
     UNLABELLED,
     ActedMotion,
@@ -26,7 +25,6 @@ from liex_lab.simulation.agents.agent import (
     Individual,
     bump,
     clock,
-    own_shares,
     slow_noise,
 )
 from liex_lab.simulation.pose_prior import bend_profile, hung, root_rotation
@@ -137,9 +135,7 @@ class FishActor:
             The motion on the 5 ms clock.
         """
         sequence = self.begin(rng)
-        names, share = own_shares(rng, _SHARES)
-        while sequence.n_steps * STEP_S < seconds:
-            word = str(rng.choice(names, p=share))
+        for word in sequence.words(rng, _SHARES, seconds):
             # most actions are followed by an unnamed movement
             if sequence.play(word, partial(self.act, rng, word), 6) and rng.random() > 0.75:
                 continue
@@ -186,11 +182,8 @@ class FishActor:
         beat: Array | float = 0.0,
     ) -> Array:
         """Control channels of one action; its speed is given in lengths per second."""
-        c = np.zeros((len(t), _CHANNELS))
-        for k, column in enumerate((speed, turn, climb, roll, front, hind, wave, beat)):
-            c[:, k] = column
-        c[:, SPEED] *= self.length_mm
-        return c
+        columns = (speed * self.length_mm, turn, climb, roll, front, hind, wave, beat)
+        return np.stack(np.broadcast_arrays(*columns, t)[:-1], axis=1).astype(float)
 
     def act(self, rng: np.random.Generator, word: str) -> Array:
         """Control channels of one action.
@@ -203,46 +196,41 @@ class FishActor:
             (m, 8): speed mm/s, turning rad/s, climb rad, roll rad, bend of the front and of the
             hind half and amplitude of the wave in degrees per joint, beat Hz.
         """
-        table: dict[str, Callable[[np.random.Generator], Array]] = {
+        actions: dict[str, Callable[[np.random.Generator], Array]] = {
             "scoot": self._scoot,
             "j_turn": self._j_turn,
             "c_turn": self._c_turn,
             "r_turn": self._r_turn,
-            "surface": lambda r: self._climb(r, 1.0),
-            "dive": lambda r: self._climb(r, -1.0),
+            "surface": partial(self._climb, side=1.0),
+            "dive": partial(self._climb, side=-1.0),
             "zigzag": self._zigzag,
             "thrash": self._thrash,
             "freeze": self._freeze,
         }
-        return table[word](rng)
+        return actions[word](rng)
 
     def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
-        """Draw the duration of an action; most are near the shortest."""
-        return float(
-            np.clip(
-                shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.fish.patience,
-                0.15,
-                longest,
-            )
-        )
+        return self.fish.duration(rng, shortest, longest, 0.15)
 
-    def _wave(self, rng: np.random.Generator, pace: float) -> tuple[float, float]:
-        """Amplitude and rate of the body wave for a speed."""
-        wave = self.fish.bend * rng.uniform(0.9, 2.1) * np.sqrt(max(pace, 0.05))
-        return wave, self.fish.tempo * (2.5 + 1.1 * pace) * rng.uniform(0.85, 1.2)
+    def _wave(self, rng: np.random.Generator, pace: float) -> dict[str, float]:
+        """Amplitude `wave` and rate `beat` of the body wave for a speed."""
+        return {
+            "wave": self.fish.bend * rng.uniform(0.9, 2.1) * np.sqrt(max(pace, 0.05)),
+            "beat": self.fish.tempo * (2.5 + 1.1 * pace) * rng.uniform(0.85, 1.2),
+        }
 
     def _scoot(self, rng: np.random.Generator) -> Array:
         t, roll = self._begin(rng, self._seconds(rng, 0.25, 1.6))
         pace = self.fish.vigour * rng.uniform(0.7, 3.6)
-        wave, beat = self._wave(rng, pace)
+        swing = self._wave(rng, pace)
         beating = t < rng.uniform(0.55, 1.0) * t[-1]
         bend = rng.normal(0.0, 0.5)
         return self._channels(
             t,
             roll,
             speed=pace * np.where(beating, 1.0, np.exp(-(t - t[beating][-1]) / 0.35)),
-            wave=wave * np.where(beating, 1.0, 0.15),
-            beat=beat,
+            wave=swing["wave"] * np.where(beating, 1.0, 0.15),
+            beat=swing["beat"],
             turn=np.radians(rng.normal(0.0, 14.0))
             + np.radians(10.0) * slow_noise(rng, len(t), 0.4)[:, 0],
             front=bend,
@@ -281,22 +269,19 @@ class FishActor:
         t, roll = self._begin(rng, self._seconds(rng, 0.25, 0.95))
         side = self.fish.turn_side(rng)
         total = float(np.clip(self.fish.bend * rng.normal(72.0, 17.0), 44.0, 112.0))
-        length = t[-1] * rng.uniform(0.75, 1.0)
-        shape = bump(t, length, rng.uniform(0.3, 0.5))
+        shape = bump(t, t[-1] * rng.uniform(0.75, 1.0), rng.uniform(0.3, 0.5))
         front, hind = self._bent(rng, side * shape, total, 0.02)
         turn = side * np.radians(total * rng.uniform(0.5, 1.1)) * shape / (shape.sum() * STEP_S)
         pace = self.fish.vigour * rng.uniform(0.3, 2.8)
-        wave, beat = self._wave(rng, 0.4 * pace)
         return self._channels(
             t,
             roll,
             speed=pace * (0.5 + 0.5 * t / t[-1]),
             turn=turn,
-            climb=np.radians(rng.normal(0.0, 6.0)),
             front=front,
             hind=hind,
-            wave=wave,
-            beat=beat,
+            **self._wave(rng, 0.4 * pace),
+            climb=np.radians(rng.normal(0.0, 6.0)),
         )
 
     def _c_turn(self, rng: np.random.Generator) -> Array:
@@ -313,7 +298,7 @@ class FishActor:
         turn = side * np.radians(total * rng.uniform(0.55, 1.0)) * shape / (shape.sum() * STEP_S)
         pace = self.fish.vigour * rng.uniform(2.5, 9.0)
         glide = np.exp(-np.maximum(t - first - 0.1, 0.0) / rng.uniform(0.2, 0.5))
-        wave, beat = self._wave(rng, 0.5 * pace)
+        swing = self._wave(rng, 0.5 * pace)
         return self._channels(
             t,
             roll,
@@ -322,30 +307,28 @@ class FishActor:
             climb=np.radians(rng.normal(0.0, 9.0)),
             front=front,
             hind=hind,
-            wave=wave * np.clip((t - first) / 0.08, 0.0, 1.0),
-            beat=beat,
+            wave=swing["wave"] * np.clip((t - first) / 0.08, 0.0, 1.0),
+            beat=swing["beat"],
         )
 
     def _climb(self, rng: np.random.Generator, side: float) -> Array:
         t, roll = self._begin(rng, self._seconds(rng, 0.5, 2.6))
         pace = self.fish.vigour * rng.uniform(0.6, 2.6)
         climb = side * np.radians(rng.uniform(15.0, 45.0)) * np.minimum(1.0, (t + 0.1) / 0.3)
-        wave, beat = self._wave(rng, pace)
         return self._channels(
             t,
             roll,
             speed=pace,
+            climb=climb,
+            **self._wave(rng, pace),
             turn=np.radians(rng.normal(0.0, 12.0))
             + np.radians(9.0) * slow_noise(rng, len(t), 0.5)[:, 0],
-            climb=climb,
             front=rng.normal(0.0, 0.4),
-            wave=wave,
-            beat=beat,
         )
 
     def _zigzag(self, rng: np.random.Generator) -> Array:
         t, roll = self._begin(rng, self._seconds(rng, 0.8, 2.6))
-        turn, front, hind = np.zeros((3, len(t)))
+        turn, bends = np.zeros(len(t)), np.zeros((2, len(t)))
         at = 0.0
         side = self.fish.turn_side(rng)
         while at < t[-1]:
@@ -353,24 +336,20 @@ class FishActor:
             shape = bump(t - at, length, 0.4) * (t >= at)
             angle = np.radians(rng.uniform(65.0, 140.0))
             turn += side * angle * shape / max(shape.sum() * STEP_S, 0.5 * length)
-            bends = self._bent(rng, side * shape, self.fish.bend * rng.uniform(40.0, 105.0), 0.02)
-            front += bends[0]
-            hind += bends[1]
+            bends += self._bent(rng, side * shape, self.fish.bend * rng.uniform(40.0, 105.0), 0.02)
             at = at + length * rng.uniform(0.8, 1.3)
             side = -side
         pace = self.fish.vigour * rng.uniform(1.2, 4.5)
         speed = pace * (0.8 + 0.25 * slow_noise(rng, len(t), 0.25)[:, 0])
-        wave, beat = self._wave(rng, 0.5 * pace)
         return self._channels(
             t,
             roll,
             speed=speed,
             turn=turn,
+            front=bends[0],
+            hind=bends[1],
+            **self._wave(rng, 0.5 * pace),
             climb=np.radians(7.0) * slow_noise(rng, len(t), 0.5)[:, 0],
-            front=front,
-            hind=hind,
-            wave=wave,
-            beat=beat,
         )
 
     def _thrash(self, rng: np.random.Generator) -> Array:
@@ -390,8 +369,7 @@ class FishActor:
 
     def _freeze(self, rng: np.random.Generator) -> Array:
         t, roll = self._begin(rng, self._seconds(rng, 0.9, 2.7))
-        speed = rng.uniform(0.0, 0.08)
-        bend = rng.normal(0.0, 0.5)
+        speed, bend = rng.uniform(0.0, 0.08), rng.normal(0.0, 0.5)
         climb = np.radians(rng.normal(0.0, 7.0))
         return self._channels(t, roll[0], speed=speed, climb=climb, front=bend, hind=1.5 * bend)
 

@@ -6,7 +6,6 @@ each of the three inner joints, and the stretch of the body. `agents.agent` filt
 the actions, `mouse_poses` places the postures on the floor.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -26,7 +25,6 @@ from liex_lab.simulation.agents.agent import (
     Individual,
     bump,
     clock,
-    own_shares,
     slow_noise,
 )
 from liex_lab.simulation.pose_prior import Posture, resting_heights, stand
@@ -137,9 +135,7 @@ class MouseActor:
         rest[_STRETCH] = 1.0
         start = np.array([*(rng.uniform(-0.5, 0.5, 2) * self.half), 0.0])
         sequence = BehaviourSequence(rest, 0.035, start, rng.uniform(-np.pi, np.pi), self.fits)
-        names, share = own_shares(rng, _SHARES)
-        while sequence.n_steps * STEP_S < seconds:
-            word = str(rng.choice(names, p=share))
+        for word in sequence.words(rng, _SHARES, seconds):
             if word == "rear_supported":
                 self._to_wall(rng, sequence)
             done = self._possible(sequence, word) and sequence.play(
@@ -157,23 +153,17 @@ class MouseActor:
 
     def _possible(self, sequence: BehaviourSequence, word: str) -> bool:
         """Whether a rear is possible here: supported near a wall ahead, else away from walls."""
-        if word == "rear_supported":
-            return self._room(sequence) < _WALL_MM
-        nose = sequence.position[:2] + 0.5 * self.spine_mm * np.array(
-            [np.cos(sequence.heading), np.sin(sequence.heading)]
-        )
-        return word != "rear_unsupported" or bool((self.half - np.abs(nose)).min() > 1.4 * _WALL_MM)
+        ahead, around = self._room(sequence)
+        near = {"rear_supported": ahead < _WALL_MM, "rear_unsupported": around > 1.4 * _WALL_MM}
+        return near.get(word, True)
 
-    def _room(self, sequence: BehaviourSequence) -> float:
-        """Distance from the nose to the wall ahead, mm."""
+    def _room(self, sequence: BehaviourSequence) -> tuple[float, float]:
+        """Distance from the nose to the wall ahead, and to the nearest wall, mm."""
         way = np.array([np.cos(sequence.heading), np.sin(sequence.heading)])
         nose = sequence.position[:2] + 0.5 * self.spine_mm * way
-        ahead = np.where(
-            np.abs(way) > 0.3,
-            (self.half - np.sign(way) * nose) / np.maximum(np.abs(way), 1e-9),
-            np.inf,
-        )
-        return float(ahead.min())
+        along = (self.half - np.sign(way) * nose) / np.maximum(np.abs(way), 1e-9)
+        ahead = np.where(np.abs(way) > 0.3, along, np.inf)
+        return float(ahead.min()), float((self.half - np.abs(nose)).min())
 
     def _to_wall(self, rng: np.random.Generator, sequence: BehaviourSequence) -> None:
         """Turn to the nearest wall and walk up to it."""
@@ -182,7 +172,7 @@ class MouseActor:
         toward[axis] = np.sign(sequence.position[axis]) or 1.0
         self._turn_by(rng, sequence, np.arctan2(toward[1], toward[0]) + rng.normal(0.0, 0.25))
         for _ in range(3):
-            clearance = self._room(sequence)
+            clearance, _ = self._room(sequence)
             if clearance < 0.8 * _WALL_MM or not np.isfinite(clearance):
                 return
             speed = self.mouse.vigour * self.mouse.size * rng.uniform(90.0, 240.0)
@@ -220,14 +210,13 @@ class MouseActor:
             (m, 12): speed mm/s, turning rad/s, climb rad, elevations of four bones rad, turns of
             three joints rad, stretch, roll rad.
         """
-        vigour = self.mouse.vigour
-        size = self.mouse.size
-        table: dict[str, Callable[[], Array]] = {
+        pace = self.mouse.vigour * self.mouse.size
+        return {
             "walk": lambda: self._stride(
-                rng, self._seconds(rng, 0.4, 2.8), vigour * size * rng.uniform(60.0, 290.0)
+                rng, self._seconds(rng, 0.4, 2.8), pace * rng.uniform(60.0, 290.0)
             ),
             "run": lambda: self._stride(
-                rng, self._seconds(rng, 0.5, 1.3), vigour * size * rng.uniform(300.0, 540.0)
+                rng, self._seconds(rng, 0.5, 1.3), pace * rng.uniform(300.0, 540.0)
             ),
             "dart": lambda: self._dart(rng),
             "turn_left": lambda: self._turning(
@@ -243,17 +232,10 @@ class MouseActor:
             "freeze": lambda: self._freeze(rng),
             "sniff": lambda: self._sniff(rng),
             "stretch_attend": lambda: self._stretch(rng),
-        }
-        return table[word]()
+        }[word]()
 
     def _seconds(self, rng: np.random.Generator, shortest: float, longest: float) -> float:
-        return float(
-            np.clip(
-                shortest + (longest - shortest) * rng.beta(1.3, 2.2) * self.mouse.patience,
-                0.25,
-                longest,
-            )
-        )
+        return self.mouse.duration(rng, shortest, longest, 0.25)
 
     def _blank(
         self, rng: np.random.Generator, seconds: float, unrest: float = 1.0
@@ -436,7 +418,5 @@ def mouse_poses(
     posture = Posture(c[:, _RISE].copy(), turn, c[:, _ROLL].copy(), c[:, _STRETCH].copy())
     heading = motion.heading[rows] - 0.5 * c[:, _BEND].sum(axis=1)
     gap = np.full(n, rng.uniform(0.0, 2.0))
-    pose, girth = stand(skeleton, posture, heading, np.full(n, size), shape[0].broadcast(n), gap)
-    middle = pose.joints(skeleton)[:, :4, :2].mean(axis=1)
-    pose.root.translation[:, :2] += motion.position[rows, :2] - middle
-    return pose, girth
+    body, middle = shape[0].broadcast(n), motion.position[rows, :2]
+    return stand(skeleton, posture, heading, np.full(n, size), body, gap, middle, 4)

@@ -34,10 +34,10 @@ from liex_lab.recordings.formats.images.nyu import (
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.hand_segmenter import sight_rotations
 from liex_lab.simulation import _render_kernels as kernels
-from liex_lab.simulation import training_patches
+from liex_lab.simulation import recording, training_patches
 from liex_lab.simulation._sensor_kernels import ANIMAL, PRIMESENSE_KIND
 from liex_lab.simulation.hand.postures import draw_postures, draw_turns
-from liex_lab.simulation.recording import OTHER_CAMERA, Actor, Split, Stage
+from liex_lab.simulation.recording import Actor, Split, Stage, Take
 from liex_lab.simulation.rendering import Solid, Views, inverse_depth
 from liex_lab.simulation.scene import BOX, SPHERE_TUBE, SimulatedScene, rounded
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor, draw_units, unseen
@@ -162,9 +162,10 @@ class Hand(Actor):
     @property
     def solids(self) -> tuple[Solid, ...]:
         """The hand and the arm."""
-        faces = self.body.flesh.faces, ARM_FACES
-        meshes = zip((self.hand, self.arm), faces, strict=True)
-        return tuple(Solid.of(*mesh, self.present, ANIMAL) for mesh in meshes)
+        return (
+            Solid.of(self.hand, self.body.flesh.faces, self.present, ANIMAL),
+            Solid.of(self.arm, ARM_FACES, self.present, ANIMAL),
+        )
 
 
 def pose_hands(angles: Array, turns: Array, size: Array, p_camera: Array) -> Pose:
@@ -269,9 +270,8 @@ def surround(
         T @ hand,
         T @ arm,
     )
-    mesh = item.vertices()
-    objects = Solid.of(T @ body, BODY_FACES), replace(item, mesh=(T @ mesh).__getitem__)
-    return actor, objects, walls
+    item = replace(item, mesh=(T @ item.vertices()).__getitem__)
+    return actor, (Solid.of(T @ body, BODY_FACES), item), walls
 
 
 def _bodies(joints: Array, elbow: Array, forward: Array, u: Array) -> tuple[Array, Array]:
@@ -326,11 +326,9 @@ def _walls(rng: np.random.Generator, m: int, intrinsics: Array, hand: Array, bod
 
 
 NYU_SENSOR = Sensor("NYU Kinect", LABEL_CAMERA, PRIMESENSE_KIND)
+# as of other animals, with other seeds
 SPLITS: Mapping[str, Split] = {
-    "clean": (81_001, "train", 1.0, 0, 0.0),
-    "hard": (82_001, "train", 2.0, 1, 0.5),
-    "other-body": (84_001, "other", 1.0, 0, 0.0),
-    OTHER_CAMERA: (85_001, "train", 1.0, 0, 0.0),
+    name: (seed + 10_000, settings) for name, (seed, settings) in recording.SPLITS.items()
 }
 # training images: (sensor, nearest and farthest hand, share)
 _KINDS = (
@@ -363,6 +361,7 @@ class HandSpecies(Species):
     splits: ClassVar[Mapping[str, Split]] = SPLITS
     sealed_seed: ClassVar[int] = 980_413
     patch_px: ClassVar[int] = 320
+    other_builds: ClassVar[bool] = False
     sources: ClassVar[str] = (
         "rendered from a seed; bones and postures from published anatomy; no depth image and no "
         "label of a real hand was used"
@@ -404,18 +403,17 @@ class HandSpecies(Species):
         n, surface = training_patches.BLOCK, Surface.of(self.skeleton)
         m = n // per_session
         each = np.repeat(np.arange(m), per_session)
-        nearest, farthest, share = np.array([kind[1:] for kind in _KINDS]).T
+        sensors = tuple(sensor for sensor, *_ in _KINDS)
+        nearest, farthest, share = np.array([numbers for _, *numbers in _KINDS]).T
         make = rng.choice(len(_KINDS), m, p=share)
-        sensors = tuple(kind[0] for kind in _KINDS)
         intrinsics, size_px, parameters = draw_units(rng, sensors, make, np.zeros(m))
         size_px[:, 1] = np.maximum(size_px[:, 1], self.patch_px)
         training_patches.degrade(rng, parameters, degraded_share)
-        flat = np.zeros((m, 3))
-        ground = np.zeros((m, kernels.N_GROUND))
+        ground, flat = np.zeros((m, kernels.N_GROUND)), np.zeros((m, 3))
         views = Views(intrinsics, size_px, SE3.identity(m), parameters, ground, flat)[each]
         shape = draw_hands(rng, self.skeleton, family, m)[each]
         size = (nominal * rng.uniform(*self.sizes, m))[each]
-        low, high = np.array([nearest, farthest])[:, make[each]]
+        low, high = nearest[make[each]], farthest[make[each]]
         turns = draw_turns(rng, n, anywhere=0.4)
         places = draw_places(rng, views.intrinsics, views.size_px, low, high)
         pose = pose_hands(draw_postures(rng, self.skeleton, n), turns, size, places)
@@ -435,9 +433,9 @@ class HandSpecies(Species):
         # an arm leaves a window as it leaves an image
         origin = views.around(hand.hand, window_px, shift)
         origin = np.clip(origin, 0, np.maximum(views.size_px - window_px, 0))
-        solids = [*hand.solids, *objects]
-        shape_px = (window_px, window_px)
-        depth, _ = replace(views, ground=walls).render(solids, seeds, origin, shape_px)
+        depth, _ = replace(views, ground=walls).render(
+            [*hand.solids, *objects], seeds, origin, (window_px, window_px)
+        )
         return TrainingPatches(
             depth,
             np.broadcast_to(np.zeros(1, np.uint16), depth.shape),
@@ -453,25 +451,14 @@ class HandSpecies(Species):
             own_bones=True,
         )
 
-    def _stage(
-        self,
-        rng: np.random.Generator,
-        sensor: Sensor,
-        length: float,
-        n: int,
-        moving: bool,
-        family: str,
-        noise: float,
-        erosion_px: int,
-        object_share: float,
-    ) -> Stage:
-        skeleton, camera = self.skeleton, sensor.camera
-        shape = draw_hands(rng, skeleton, family, 1)[np.zeros(n, np.int64)]
+    def _stage(self, rng: np.random.Generator, take: Take, length: float) -> Stage:
+        skeleton, camera, n = self.skeleton, take.sensor.camera, take.n_frames
+        shape = draw_hands(rng, skeleton, take.family, 1)[np.zeros(n, np.int64)]
         intrinsics = np.tile(camera.intrinsics, (n, 1))
         size_px = np.tile(np.array([camera.width, camera.height]), (n, 1))
-        act = self._gestures if moving else self._test_hands
+        act = self._gestures if take.moving else self._test_hands
         angles, turns, places, wrists = act(rng, intrinsics, size_px)
-        parameters = sensor.draw(rng, 1, np.zeros(1), noise, erosion_px)
+        parameters = take.parameters(rng, np.zeros(1))
         pose = pose_hands(angles, turns, np.full(n, length / skeleton.length), places)
         T = Floor.from_plane(np.array([0.0, 0.0, 1.0]), 1300.0, camera).T_arena_camera
         hand, objects, walls = surround(
@@ -479,21 +466,24 @@ class HandSpecies(Species):
             pose,
             shape,
             intrinsics,
-            object_share,
-            n if moving else 1,
+            take.object_share,
+            n if take.moving else 1,
             wrists,
             Surface.of(skeleton),
             T,
         )
+        scene = SimulatedScene(camera, T, BOX, np.zeros(2), np.full(2, np.inf), 0.0, 0.0)
         return Stage(
-            SimulatedScene(camera, T, BOX, np.zeros(2), np.full(2, np.inf), 0.0, 0.0),
+            scene,
             skeleton,
             (hand,),
             objects,
-            np.repeat(parameters, n, axis=0),
+            parameters,
             rng.integers(1, 2**63, n).astype(np.uint64),
             np.arange(n) * self.frame_ns,
-            ground=walls,
+            scene.still[None],
+            np.zeros(n, np.int64),
+            walls,
         )
 
     def _test_hands(

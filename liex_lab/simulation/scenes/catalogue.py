@@ -12,7 +12,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.hand.simulator import HandSpecies
-from liex_lab.simulation.recording import Actor, RenderedRecording, Stage
+from liex_lab.simulation.recording import Actor, RenderedRecording, Stage, Take
 from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import (
     BOX,
@@ -182,62 +182,54 @@ class Making:
     Attributes:
         recipe: the scene's recipe.
         seed: seed of all random numbers.
-        n_frames: length of the recording.
-        sensor: the camera's make.
-        family: of body shapes, see `body.shape.draw_shapes`.
-        spine_mm: length of the animals, mm; None draws it.
+        take: settings of the recording.
     """
 
     recipe: SceneRecipe
     seed: int
-    n_frames: int
-    sensor: Sensor
-    family: str
-    spine_mm: float | None
+    take: Take
 
     def _rng(self, part: str) -> np.random.Generator:
         parts = ("camera", "place", "floor", "bedding", "worn", "sensor", "noise", "object")
         return np.random.default_rng([self.seed, 77, parts.index(part)])
 
-    def recording(self, name: str) -> RenderedRecording:
-        """The recording of this name with the truth of all animals in it."""
-        recipe, n = self.recipe, self.n_frames
+    def recording(self) -> RenderedRecording:
+        """The recording with the truth of all animals in it."""
+        recipe, n = self.recipe, self.take.n_frames
         species = MouseSpecies()
         arenas = self._arenas()
         animals, moving, parts = self._cast(species, arenas)
-        beddings: list[Bedding] = []
         floor = self._rng("floor")
         grounds = [Ground.draw(floor, arena) for arena in arenas]
+        bedding = None
         if recipe.bedding:
-            tracks = _middle(animals[0])
-            present = np.where(animals[0].present[:, None], tracks, np.nan)
-            beddings = [Bedding.draw(self._rng("bedding"), grounds[0], present, self._epoch_frames)]
+            there = np.where(animals[0].present[:, None], _middle(animals[0]), np.nan)
+            bedding = Bedding.draw(self._rng("bedding"), grounds[0], there, self._epoch_frames)
             lift = SE3.identity(n)
-            lift.translation[:, 2] = beddings[0].below(np.nan_to_num(present))
+            lift.translation[:, 2] = bedding.below(np.nan_to_num(there))
             animals[0] = replace(animals[0], pose=animals[0].pose.moved(lift))
         moving += self._worn(species, arenas[0], animals, parts)
-        stills, epoch = self._stills(arenas, grounds, beddings, parts)
+        stills, epoch = self._stills(arenas, grounds, bedding, parts)
         fur = animals[0].body.fur if animals else np.array([0.5])
-        parameters = self.sensor.draw(self._rng("sensor"), 1, fur)
         warming = 1.0 - np.exp(-np.arange(n) / max(1.0, 0.35 * n))
         stage = Stage(
             arenas[0],
             species.skeleton,
             tuple(animals),
             tuple(moving),
-            np.repeat(parameters, n, axis=0),
+            self.take.parameters(self._rng("sensor"), fur),
             self._rng("noise").integers(1, 2**63, n).astype(np.uint64),
             np.arange(n) * species.frame_ns,
             stills,
             epoch,
             offset_mm=recipe.drift_mm * warming if recipe.drift_mm else None,
         )
-        return RenderedRecording(name, stage)
+        return RenderedRecording(self.take.name, stage)
 
     @property
     def _epoch_frames(self) -> int:
         # at most 64 still depth images
-        return max(12, -(-self.n_frames // 64))
+        return max(12, -(-self.take.n_frames // 64))
 
     def _arenas(self) -> list[SimulatedScene]:
         """The arenas in the image, around the point where the camera's axis meets the floor,
@@ -245,7 +237,7 @@ class Making:
         """
         recipe = self.recipe
         rng = self._rng("camera")
-        camera = self.sensor.camera
+        camera = self.take.sensor.camera
         toward = np.pi / 2 + float(rng.uniform(-0.3, 0.3))
         T_arena_camera = overhead_pose(
             *np.array([[recipe.camera_mm], [recipe.tilt_rad], [toward]])
@@ -267,7 +259,7 @@ class Making:
 
     def _house(self, arena: SimulatedScene) -> tuple[Array, float]:
         """Position of a house, (2,) mm, and the direction of its exit, rad."""
-        corner = turned((arena.half - [85.0, 75.0]) * [1.0, 1.0], arena.yaw)
+        corner = turned(arena.half - [85.0, 75.0], arena.yaw)
         return arena.centre + corner, float(np.pi + arena.yaw)
 
     def _clutter(self, arena: SimulatedScene) -> Array:
@@ -291,7 +283,7 @@ class Making:
     ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals, the objects that move with them, and the still objects they need."""
         recipe = self.recipe
-        timing = timing_of(recipe.presence, self.n_frames)
+        timing = timing_of(recipe.presence, self.take.n_frames)
         script = path = None
         still: list[Mesh] = []
         moving: list[Solid] = []
@@ -303,23 +295,30 @@ class Making:
             still += places.house(arenas[0], place, out)
         animals: list[Actor] = []
         for which in range(max(recipe.n_animals, recipe.n_arenas) if recipe.n_animals else 0):
-            arena = arenas[which % len(arenas)]
             if which and recipe.n_arenas == 1:
                 path = keeping_apart(_middle(animals[0]), animals[0].spine_mm)
-            animal = draw_mouse(
-                self.seed, which, species, arena, self.family, self.spine_mm, timing, script, path
+            animals.append(
+                draw_mouse(
+                    self.seed,
+                    which,
+                    species,
+                    arenas[which % len(arenas)],
+                    self.take,
+                    timing,
+                    script,
+                    path,
+                )
             )
-            animals.append(animal)
         if recipe.fixture in _OBJECTS:
-            change = int(_OBJECTS[recipe.fixture] * self.n_frames)
-            later = np.arange(self.n_frames) >= change
+            change = int(_OBJECTS[recipe.fixture] * self.take.n_frames)
+            later = np.arange(self.take.n_frames) >= change
             item = self._object(arenas[0])
             moving.append(Solid.of(*item, later if recipe.fixture == "object" else ~later))
             moving.append(self._hand(item.vertices[:, :2].mean(axis=0), change))
         if recipe.presence in ("late", "leaves") and animals:
             there = animals[0].present
             change = int(np.argmax(there)) if recipe.presence == "late" else int(there.sum())
-            spot = _middle(animals[0])[min(change, self.n_frames - 1)]
+            spot = _middle(animals[0])[min(change, self.take.n_frames - 1)]
             moving.append(self._hand(spot, change))
         return animals, moving, still
 
@@ -331,7 +330,7 @@ class Making:
         reach = 8
         height = 45.0 + 22.0 * np.abs(np.arange(-reach, reach + 1))
         vertices = mesh + np.column_stack([np.tile(spot, (len(height), 1)), height])[:, None]
-        moment = np.arange(self.n_frames) - change + reach
+        moment = np.arange(self.take.n_frames) - change + reach
         there = (moment >= 0) & (moment < len(height))
         return Solid(OBJECT_FACES, np.where(there, moment, -1), vertices.__getitem__)
 
@@ -362,7 +361,7 @@ class Making:
         self,
         arenas: list[SimulatedScene],
         grounds: list[Ground],
-        beddings: list[Bedding],
+        bedding: Bedding | None,
         parts: list[Mesh],
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """The still scene by epoch (E, H, W) mm, and the epoch of every frame (n,)."""
@@ -371,7 +370,7 @@ class Making:
         fixed = list(parts)
         for arena in arenas:
             lid = recipe.fixture == "lid"
-            fixed += places.walls_of(arena, *((14.0, 13.0) if lid else ()))
+            fixed.append(places.walls_of(arena, *((14.0, 13.0) if lid else ())))
             fixed += places.lid_bars(arena) if lid else []
         if recipe.around == "table":
             fixed += places.table(rng, arenas[0], 480.0)
@@ -379,23 +378,21 @@ class Making:
             fixed += places.untidy(rng, arenas[0])
         else:
             fixed.append(places.level(np.mean([arena.centre for arena in arenas], axis=0)))
-        camera = arenas[0].camera
-        T_camera_arena = arenas[0].T_arena_camera.inverse()
-        floors = [] if beddings else [ground.mesh() for ground in grounds]
-        base = render_still([*fixed, *floors], camera, T_camera_arena)
-        if not (beddings or recipe.glossy):
-            return base[None], np.zeros(self.n_frames, np.int64)
-        bare = render_still(floors, camera, T_camera_arena) == base
-        epoch = np.arange(self.n_frames) // self._epoch_frames
+        camera, T_camera_arena = arenas[0].camera, arenas[0].T_arena_camera.inverse()
+        floors = [ground.mesh() for ground in grounds]
+        base, bare = (
+            render_still(parts, camera, T_camera_arena) for parts in ([*fixed, *floors], floors)
+        )
+        changes = bedding is not None or recipe.glossy
+        epoch = np.arange(self.take.n_frames) // self._epoch_frames * changes
         stills = np.repeat(base[None], epoch[-1] + 1, axis=0)
         for e, still in enumerate(stills):
-            for bedding in beddings:
-                mesh = bedding.ground.mesh(bedding.heights[e])
-                lain = render_still([mesh], camera, T_camera_arena)
-                nearer = (lain > 0) & ((still == 0) | (lain < still))
-                still[nearer] = lain[nearer]
+            if bedding:
+                lain = bedding.ground.mesh(bedding.heights[e])
+                still[:] = render_still([*fixed, lain], camera, T_camera_arena)
             if recipe.glossy:
-                still[bare & _reflections(self._rng("floor"), rng, camera, still.shape)] = 0.0
+                unread = _reflections(self._rng("floor"), rng, camera, still.shape)
+                still[(bare == base) & unread] = 0.0
         return stills, epoch
 
 
@@ -420,12 +417,11 @@ def _reflections(
     """
     v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
     strength = np.full(shape, -1.0)
-    spots = [(camera.cx, camera.cy, 26.0)]
-    spots += [
+    patches = [
         (same.uniform(0.2, 0.8) * camera.width, same.uniform(0.2, 0.8) * camera.height, r)
         for r in same.uniform(5.0, 16.0, 7)
     ]
-    for at_u, at_v, radius in spots:
+    for at_u, at_v, radius in [(camera.cx, camera.cy, 26.0), *patches]:
         wide = same.uniform(0.8, 2.2)
         way = same.uniform(-np.pi, np.pi)
         x, y = (turned(np.stack([u - at_u, v - at_v], axis=-1), way) / radius).transpose(2, 0, 1)
@@ -471,12 +467,14 @@ def film(
     """
     if name not in SCENES:
         raise RecordingError(f"there is no scene '{name}'; known are {', '.join(SCENES)}")
-    title = f"scene-{name}-{seed}"
+    settings: dict[str, Any] = {
+        "family": family,
+        "spine_mm": spine_mm,
+        "name": f"scene-{name}-{seed}",
+    }
     if name in RECIPES:
-        making = Making(RECIPES[name], seed, n_frames, sensor, family, spine_mm)
-        return making.recording(title)
-    body: dict[str, Any] = {"family": family, "spine_mm": spine_mm, "name": title}
+        return Making(RECIPES[name], seed, Take(n_frames, sensor, **settings)).recording()
     if name == "fish":
-        return FishSpecies().motion([seed, 5], n_frames, **body)
-    hand = HandSpecies().motion([seed, 6], n_frames, **body)
-    return hand if name == "hand" else RenderedRecording(title, hand.stage, mirrored=True)
+        return FishSpecies().motion([seed, 5], n_frames, **settings)
+    hand = HandSpecies().motion([seed, 6], n_frames, **settings)
+    return hand if name == "hand" else RenderedRecording(hand.name, hand.stage, mirrored=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from liex_lab.geometry import SE3, so3
 from liex_lab.simulation.locomotion import smoothed
-from liex_lab.simulation.recording import Actor, RenderedRecording
+from liex_lab.simulation.recording import Actor, RenderedRecording, Take
 from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import SimulatedScene
 from liex_lab.simulation.scenes.catalogue import RECIPES, Making
@@ -335,7 +335,7 @@ class _Making(Making):
         self, species: MouseSpecies, arenas: list[SimulatedScene]
     ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals of the group, and nothing else."""
-        paths = np.stack(self.group.rows[: self.n_frames], axis=1)
+        paths = np.stack(self.group.rows[: self.take.n_frames], axis=1)
         return [self._mouse(k, path, species, arenas[0]) for k, path in enumerate(paths)], [], []
 
     def _mouse(
@@ -351,9 +351,8 @@ class _Making(Making):
             which,
             species,
             arena,
-            self.family,
-            spine,
-            timing_of("always", self.n_frames),
+            replace(self.take, spine_mm=spine),
+            timing_of("always", self.take.n_frames),
             lambda rng, n: (kinds, speed),
             lambda rng, scene, spine_mm, mm_s: (place, heading),
         )
@@ -409,7 +408,8 @@ def film_group(
         The recording with the truth of all animals, and the acts within it.
     """
     recipe = RECIPES["plain"]
-    making = Making(recipe, seed, n_frames, sensor, family, spine_mm)
+    take = Take(n_frames, sensor, family=family, spine_mm=spine_mm, name=f"pair-{seed}")
+    making = Making(recipe, seed, take)
     rng = np.random.default_rng([seed, 78])
     base = spine_mm or float(rng.uniform(60.0, 74.0))
     group = Group(
@@ -420,8 +420,8 @@ def film_group(
             agent, target = rng.permutation(animals)[:2]
             group.wait(float(rng.uniform(0.5, 1.0)))
             _play(group, int(agent), int(target), str(action))
-    filmed = _Making(recipe, seed, n_frames, sensor, family, spine_mm, group)
+    filmed = _Making(recipe, seed, take, group)
     within = [
         act._replace(stop=min(act.stop, n_frames)) for act in group.acts if act.start < n_frames
     ]
-    return filmed.recording(f"pair-{seed}"), within
+    return filmed.recording(), within

@@ -20,7 +20,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.locomotion import smoothed
-from liex_lab.simulation.scene import ROUND, SimulatedScene, turned, unevenness
+from liex_lab.simulation.scene import ROUND, SimulatedScene, rounding, turned, unevenness
 
 Array = NDArray[np.float64]
 CABLE_SEGMENTS = 6
@@ -45,14 +45,6 @@ class Mesh(NamedTuple):
 
     vertices: Array
     faces: NDArray[np.int32]
-
-
-def joined(parts: Sequence[Mesh]) -> Mesh:
-    """One mesh with the triangles of at least one, whose vertices may have a leading axis (n)."""
-    starts = np.cumsum([0, *(part.vertices.shape[-2] for part in parts)])
-    faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
-    vertices = np.concatenate([part.vertices for part in parts], axis=-2)
-    return Mesh(vertices, np.concatenate(faces).astype(np.int32))
 
 
 def box(centre: Sequence[float] | Array, half: Sequence[float] | Array, yaw: float = 0.0) -> Mesh:
@@ -88,43 +80,12 @@ def field(x: Array, y: Array, heights: Array) -> Mesh:
     return Mesh(vertices, np.concatenate([lower, upper]).astype(np.int32))
 
 
-def wall(outline: Array, foot: float, rim: float, thick: float, slope: float = 0.0) -> Mesh:
-    """A closed wall along an outline, with its rim on top.
-
-    Args:
-        outline: (n, 2) its inner foot, counter-clockwise about the origin of the outline, mm.
-        foot: height of its foot, mm.
-        rim: height of its rim, mm.
-        thick: width of the rim, mm.
-        slope: horizontal distance of the rim outside the foot, mm.
-
-    Returns:
-        The mesh: inner face, rim and outer face.
-    """
-    n = len(outline)
-    middle = outline.mean(axis=0)
-    outward = outline - middle
-    reach = np.linalg.norm(outward, axis=1, keepdims=True)
-    rings = [
-        (outline, foot),
-        (middle + outward * (1.0 + slope / reach), rim),
-        (middle + outward * (1.0 + (slope + thick) / reach), rim),
-        (middle + outward * (1.0 + thick / reach), foot),
-    ]
-    vertices = np.concatenate([np.column_stack([xy, np.full(n, z)]) for xy, z in rings])
-    k = np.arange(n, dtype=np.int32)
-    ring = n * np.arange(len(rings) - 1, dtype=np.int32)[:, None]
-    low, low_next = ring + k, ring + (k + 1) % n
-    faces = [[low, low_next, low_next + n], [low, low_next + n, low + n]]
-    return Mesh(vertices, np.moveaxis(np.array(faces, np.int32), 1, -1).reshape(-1, 3))
-
-
-def cables(curves: Array, radius: Array | float) -> Mesh:
+def cables(curves: Array, radius: float) -> Mesh:
     """Tubes along curves, one per frame.
 
     Args:
         curves: (n, R, 3) mm, their midlines.
-        radius: mm, one or (n,).
+        radius: mm.
 
     Returns:
         Vertices (n, V, 3) mm and their shared faces (F, 3) int32.
@@ -137,8 +98,7 @@ def cables(curves: Array, radius: Array | float) -> Mesh:
     other = np.cross(along, side)
     phi = 2 * np.pi * np.arange(CABLE_SEGMENTS) / CABLE_SEGMENTS
     around = np.cos(phi)[:, None] * side[:, :, None] + np.sin(phi)[:, None] * other[:, :, None]
-    thick = np.asarray(radius)[..., None, None, None]
-    skin = (curves[:, :, None] + thick * around).reshape(n, -1, 3)
+    skin = (curves[:, :, None] + radius * around).reshape(n, -1, 3)
     vertices = np.concatenate([curves[:, :1], skin, curves[:, -1:]], axis=1)
     return Mesh(vertices, tube_faces(rings, CABLE_SEGMENTS))
 
@@ -147,17 +107,17 @@ def render_still(parts: Sequence[Mesh], camera: Camera, T_camera_arena: SE3) -> 
     """Ideal depth of still objects.
 
     Args:
-        parts: the objects; each within view of the camera, not behind it.
+        parts: at least one object; each within view of the camera, not behind it.
         camera: the ideal pinhole camera.
         T_camera_arena: transform from the arena frame into the camera frame.
 
     Returns:
         (H, W) float32 mm, 0 for nothing.
     """
-    if not parts:
-        return np.zeros((camera.height, camera.width), np.float32)
-    mesh = joined(parts)
-    return render_mesh(mesh.vertices, mesh.faces, camera, T_camera_mesh=T_camera_arena)
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + np.int32(start) for part, start in zip(parts, starts, strict=False)]
+    vertices = np.concatenate([part.vertices for part in parts])
+    return render_mesh(vertices, np.concatenate(faces), camera, T_camera_mesh=T_camera_arena)
 
 
 # Equipment of animals: a head stage, and a cable from it to a commutator above the arena.
@@ -182,7 +142,7 @@ def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> S
     Returns:
         (n) T_arena_mount: x forward, z up from the skull, the origin on the skin.
     """
-    frames = pose.frames(skeleton)
+    neck = pose.frames(skeleton)[:, _NECK]
     stations = np.asarray(skeleton.surface["stations"], float)
     k = int(np.searchsorted(stations, _AT_STATION)) - 1
     share = (_AT_STATION - stations[k]) / (stations[k + 1] - stations[k])
@@ -190,9 +150,7 @@ def on_head(skeleton: Skeleton, pose: Pose, shape: BodyShape, girth: Array) -> S
     reach = np.linalg.norm(skeleton.offsets[1:], axis=1)
     ahead = (_AT_STATION * reach.sum() - reach[: _NECK + 1].sum()) * pose.scale
     local = np.stack([ahead, np.zeros_like(ahead), thick * girth], axis=-1)
-    rotation = frames.rotation[:, _NECK]
-    shift = np.einsum("nij,nj->ni", rotation, local)
-    return SE3(rotation, frames.translation[:, _NECK] + shift)
+    return SE3(neck.rotation, neck @ local)
 
 
 def stage_on(mount: SE3, sides_mm: tuple[float, float, float]) -> Mesh:
@@ -207,12 +165,11 @@ def stage_on(mount: SE3, sides_mm: tuple[float, float, float]) -> Mesh:
     """
     half = 0.5 * np.array(sides_mm)
     block = box([0.0, 0.0, half[2] - 1.0], half)
-    placed = np.einsum("nij,vj->nvi", mount.rotation, block.vertices) + mount.translation[:, None]
-    return Mesh(placed, block.faces)
+    return Mesh(mount[:, None] @ block.vertices, block.faces)
 
 
 def tether(rng: np.random.Generator, mount: SE3, commutator: Array, thick_mm: float) -> Mesh:
-    """A flexible cable from the head to a commutator.
+    """A flexible cable from the head to a commutator, which bows to a side that turns slowly.
 
     Args:
         rng: random number generator.
@@ -224,25 +181,20 @@ def tether(rng: np.random.Generator, mount: SE3, commutator: Array, thick_mm: fl
         Vertices (n, V, 3) mm, arena frame, and faces (F, 3).
     """
     n = len(mount.translation)
-    way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, (n, 1)), 12.0))
-    longest = float(np.linalg.norm(commutator - mount.translation, axis=-1).max())
-    length = np.full(n, longest * rng.uniform(1.03, 1.08))
-    return cables(_hanging(mount, commutator, length, way), 0.5 * thick_mm)
-
-
-def _hanging(mount: SE3, commutator: Array, length: Array, way: Array) -> Array:
-    """Midlines (n, R, 3) mm of cables that bow towards `way` (n,) rad; `length` (n,) mm."""
+    way = rng.uniform(-np.pi, np.pi) + np.cumsum(smoothed(rng.normal(0.0, 0.12, n), 12.0))
+    longest = np.linalg.norm(commutator - mount.translation, axis=-1).max()
+    length = longest * rng.uniform(1.03, 1.08)
     start = mount.translation + PLUG_MM[2] * mount.rotation[..., 2]
     span = commutator - start
     apart = np.linalg.norm(span, axis=-1)
     bow = 2.0 / np.pi * np.sqrt(apart * np.maximum(length - apart, 0.0))
-    side = np.stack([np.cos(way), np.sin(way), np.full(len(way), -0.15)], axis=-1)
+    side = np.stack([np.cos(way), np.sin(way), np.full(n, -0.15)], axis=-1)
     s = np.linspace(0.0, 1.0, _RINGS)[:, None]
     straight = start[:, None] + s * span[:, None]
     swing = (bow[:, None] * side)[:, None] * np.sin(np.pi * s)
     # stiff at the plug: it rises from the head before it bends
     stiff = (25.0 * mount.rotation[..., 2])[:, None] * (s * np.exp(-((s / 0.12) ** 2)) / 0.06)
-    return np.asarray(straight + swing + stiff)
+    return cables(straight + swing + stiff, 0.5 * thick_mm)
 
 
 def holder(commutator: Array) -> list[Mesh]:
@@ -263,16 +215,6 @@ _RIM_MM = 5.0
 _BASE_MM = 6.0  # between an arena's floor and the surface below
 _OUTLINE = 48  # corners of a round wall
 _LUMP_MM = 18.0
-
-
-def outline_of_walls(arena: SimulatedScene) -> Array:
-    """The foot of an arena's walls: (n, 2) corners, counter-clockwise, mm."""
-    if arena.kind == ROUND:
-        phi = 2 * np.pi * np.arange(_OUTLINE) / _OUTLINE
-        local = arena.half[0] * np.stack([np.cos(phi), np.sin(phi)], axis=-1)
-    else:
-        local = arena.half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    return arena.centre + turned(local, arena.yaw)
 
 
 @dataclass(frozen=True)
@@ -303,20 +245,16 @@ class Ground:
         local = np.stack(np.meshgrid(x, y), axis=-1)
         heights = unevenness(rng, local, most=0.6)
         clearance = arena.wall_clearance(arena.centre + turned(local, arena.yaw))
-        if arena.wall_mm > 0:
-            heights += rng.uniform(0.0, 8.0) * np.exp(
-                -np.maximum(clearance, 0.0) / rng.uniform(6.0, 18.0)
-            )
+        heights += rounding(rng, clearance, 8.0, 18.0)
         return Ground(arena, x, y, heights, clearance > -1.5 * _GRID_MM)
 
-    def mesh(self, bedding: Array | None = None) -> Mesh:
+    def mesh(self, bedding: Array | float = 0.0) -> Mesh:
         """The floor as a mesh in the arena frame.
 
         Args:
-            bedding: (m, n) heights of bedding, mm; None for no bedding.
+            bedding: (m, n) heights of bedding on it, mm.
         """
-        heights = self.heights if bedding is None else self.heights + bedding
-        flat = field(self.x, self.y, heights)
+        flat = field(self.x, self.y, self.heights + bedding)
         xy = self.arena.centre + turned(flat.vertices[:, :2], self.arena.yaw)
         inside = self.within.ravel()[flat.faces].all(axis=1)
         return Mesh(np.concatenate([xy, flat.vertices[:, 2:]], axis=1), flat.faces[inside])
@@ -361,9 +299,8 @@ class Bedding:
             The bedding of all epochs.
         """
         grid = np.stack(np.meshgrid(ground.x, ground.y), axis=-1)
-        area = float(np.prod(2.0 * ground.arena.half))
         # one lump per square of 26 mm
-        n_lumps = int(area / 26.0**2)
+        n_lumps = int(np.prod(2.0 * ground.arena.half) / 26.0**2)
         places = rng.uniform(-1.0, 1.0, (n_lumps, 2)) * ground.arena.half
         tall = _LUMP_MM * rng.uniform(0.35, 1.0, n_lumps)
         wide = rng.uniform(8.0, 18.0, n_lumps)
@@ -402,8 +339,7 @@ class Bedding:
             columns = np.abs(self.ground.x - spot[0]) < 20.0
             patch = self.heights[i // self.frames][np.ix_(rows, columns)]
             height[i] = float(patch.mean()) if patch.size else 0.0
-        bell = np.exp(-0.5 * (np.arange(-15, 16) / 5.0) ** 2)
-        return np.convolve(np.pad(height, 15, mode="edge"), bell / bell.sum(), mode="valid")
+        return smoothed(height, 5.0, deviations=3.0)
 
 
 def _lumps(grid: Array, places: Array, tall: Array, wide: Array) -> Array:
@@ -415,20 +351,36 @@ def _lumps(grid: Array, places: Array, tall: Array, wide: Array) -> Array:
     return height
 
 
-def walls_of(arena: SimulatedScene, slope: float = 0.0, rim_mm: float = _RIM_MM) -> list[Mesh]:
-    """The walls of an arena.
+def walls_of(arena: SimulatedScene, slope: float = 0.0, rim_mm: float = _RIM_MM) -> Mesh:
+    """The walls of an arena: inner face, rim and outer face.
 
     Args:
-        arena: the arena; a wall height of 0 has none.
+        arena: the arena.
         slope: horizontal distance of the rim outside the foot, mm.
         rim_mm: width of the rim, mm.
-
-    Returns:
-        Their meshes.
     """
-    if arena.wall_mm <= 0.0:
-        return []
-    return [wall(outline_of_walls(arena), -_BASE_MM, arena.wall_mm, rim_mm, slope)]
+    if arena.kind == ROUND:
+        phi = 2 * np.pi * np.arange(_OUTLINE) / _OUTLINE
+        local = arena.half[0] * np.stack([np.cos(phi), np.sin(phi)], axis=-1)
+    else:
+        local = arena.half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    outline = arena.centre + turned(local, arena.yaw)
+    n = len(outline)
+    middle = outline.mean(axis=0)
+    outward = outline - middle
+    reach = np.linalg.norm(outward, axis=1, keepdims=True)
+    rings = [
+        (outline, -_BASE_MM),
+        (middle + outward * (1.0 + slope / reach), arena.wall_mm),
+        (middle + outward * (1.0 + (slope + rim_mm) / reach), arena.wall_mm),
+        (middle + outward * (1.0 + rim_mm / reach), -_BASE_MM),
+    ]
+    vertices = np.concatenate([np.column_stack([xy, np.full(n, z)]) for xy, z in rings])
+    k = np.arange(n, dtype=np.int32)
+    ring = n * np.arange(len(rings) - 1, dtype=np.int32)[:, None]
+    low, low_next = ring + k, ring + (k + 1) % n
+    faces = [[low, low_next, low_next + n], [low, low_next + n, low + n]]
+    return Mesh(vertices, np.moveaxis(np.array(faces, np.int32), 1, -1).reshape(-1, 3))
 
 
 def level(middle: Array, z: float = -_BASE_MM) -> Mesh:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from liex_lab.body.shape import Surface
 from liex_lab.simulation.locomotion import Path, Script, free_path, smoothed, walk, waver
-from liex_lab.simulation.recording import Actor
+from liex_lab.simulation.recording import Actor, Take
 from liex_lab.simulation.scene import SimulatedScene
 from liex_lab.simulation.species import MouseSpecies
 
@@ -26,8 +26,7 @@ def draw_mouse(
     which: int,
     species: MouseSpecies,
     arena: SimulatedScene,
-    family: str,
-    spine_mm: float | None,
+    take: Take,
     timing: tuple[NDArray[np.int64], NDArray[np.bool_]],
     script: Script | None = None,
     path: Path | None = None,
@@ -39,29 +38,26 @@ def draw_mouse(
         which: number of the animal.
         species: the mouse.
         arena: the arena.
-        family: of body shapes, see `draw_shapes`.
-        spine_mm: its length, mm; None draws it.
+        take: its length and the family of its body's shape.
         timing: index of the moment of its walk in each frame (n,), and its presence (n,).
         script: its activity, see `locomotion.walk`.
         path: its path, likewise.
     """
     moments, present = timing
     body = np.random.default_rng([seed, which, 1])
-    drawn = float(body.uniform(55.0, 75.0))
-    spine = drawn if spine_mm is None else float(spine_mm)
-    shape = species.shapes(body, family, 1)
+    drawn = body.uniform(55.0, 75.0)
+    spine = float(drawn if take.spine_mm is None else take.spine_mm)
+    shape = species.shapes(body, take.family, 1)
     n_moments = int(moments.max()) + 1
-    going = np.random.default_rng([seed, which, 2])
-    skeleton = species.skeleton
-    pose, girth = walk(going, arena, skeleton, shape, spine, n_moments, script, path)
-    tail = np.random.default_rng([seed, which, 3])
+    going, tail = (np.random.default_rng([seed, which, part]) for part in (2, 3))
+    pose, girth = walk(going, arena, species.skeleton, shape, spine, n_moments, script, path)
     first = species.bends(tail, 1)
     bends = first + waver(tail, (n_moments, first.shape[1]))
     asleep = np.diff(moments, prepend=moments[0] - 1) == 0
     # share of the girth; breaths per frame
     breath = 1.0 + 0.012 * np.sin(2 * np.pi * 2.5 * np.arange(len(moments)) / _RATE_HZ)
     girth = girth[moments] * np.where(asleep, breath, 1.0)
-    surface = Surface.of(skeleton)
+    surface = Surface.of(species.skeleton)
     return Actor(surface, spine, shape, pose[moments], girth, bends[moments], present)
 
 
@@ -104,7 +100,7 @@ def calm_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Ar
         pause = stop + int(_RATE_HZ * rng.uniform(0.1, 0.8))
         speed[stop:pause] = 0.0
         at = pause
-    return np.zeros(n, np.int64), np.maximum(smoothed(speed[:, None], 3.6)[:, 0], 0.0)
+    return np.zeros(n, np.int64), np.maximum(smoothed(speed, 3.6), 0.0)
 
 
 def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...]) -> Path:
@@ -123,8 +119,7 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
         rng: np.random.Generator, scene: SimulatedScene, spine_mm: float, speed: Array
     ) -> tuple[Array, Array]:
         n = len(speed)
-        position = np.empty((n, 2))
-        heading = np.empty(n)
+        position, heading = np.empty((n, 2)), np.empty(n)
         goals = [free_spot(rng, scene, 0.8 * spine_mm) for _ in range(40)]
         at = door + 0.6 * (door - inside)
         way = rng.uniform(-np.pi, np.pi)
@@ -150,8 +145,7 @@ def visiting(door: Array, inside: Array, spans: tuple[tuple[float, float], ...])
                 step = run * facing * np.array([np.cos(way), np.sin(way)])
                 if errand or scene.freedom(at + step) > 0.4 * spine_mm:
                     at = at + step
-            position[i] = at
-            heading[i] = way
+            position[i], heading[i] = at, way
         return position, heading
 
     return path
@@ -188,17 +182,11 @@ def keeping_apart(other: Array, spine_mm: float) -> Path:
     def path(
         rng: np.random.Generator, scene: SimulatedScene, own_mm: float, speed: Array
     ) -> tuple[Array, Array]:
-        best: tuple[Array, Array] | None = None
-        best_gap = -np.inf
-        for _ in range(_TRIES):
-            position, heading = free_path(rng, scene, own_mm, speed)
-            gap = float(np.linalg.norm(position - other[: len(position)], axis=1).min())
-            if gap > best_gap:
-                best = (position, heading)
-                best_gap = gap
-            if gap > 0.95 * 0.5 * (spine_mm + own_mm):
-                break
-        assert best is not None
-        return best
+        tried: list[tuple[Array, Array]] = []
+        gaps: list[float] = []
+        while len(tried) < _TRIES and (not gaps or gaps[-1] <= 0.95 * 0.5 * (spine_mm + own_mm)):
+            tried.append(free_path(rng, scene, own_mm, speed))
+            gaps.append(np.linalg.norm(tried[-1][0] - other[: len(speed)], axis=1).min())
+        return tried[int(np.argmax(gaps))]
 
     return path
