@@ -32,6 +32,7 @@ def sync_session(
     pairs: str | Path | None = None,
     first: bool = False,
     author: str = "",
+    report: bool = True,
     progress: Progress = silent,
 ) -> ClockFit:
     """Put a session's times on the clock of another instrument.
@@ -53,6 +54,7 @@ def sync_session(
         pairs: table of moments known on both clocks, columns time_s and other_s.
         first: whether the first events of both sides are the same.
         author: author of the change; "" uses the current account.
+        report: whether to regenerate report and figures.
         progress: receives progress reports.
 
     Raises:
@@ -81,7 +83,8 @@ def sync_session(
         found, name = align(own_s, other_s, stated), Path(other).name
     fit = _record(found, own_s, first_ns, name, source)
     known = read_log(raw.path).clock == fit
-    correct_session(raw.path, () if known else (fit,), author=author, progress=progress)
+    what = () if known else (fit,)
+    correct_session(raw.path, what, author=author, report=report, progress=progress)
     return fit
 
 

@@ -276,7 +276,7 @@ def _seeds(x: Array, y: Array, reach: float, stated: Array, near: float) -> Iter
     for one, (own, other, within) in zip(rows, about, strict=True):
         window = x[one] - own
         fine = max(_FINE * reach, MOST_DRIFT * float(np.ptp(window)) / (3.0 * _MOST_RATES))
-        for near_s in {reach, min(fine, reach)}:
+        for near_s in (reach, min(fine, reach)):
             step = 3.0 * near_s / float(np.ptp(window))
             n = int(MOST_DRIFT / step)
             votes = [
@@ -291,6 +291,8 @@ def _seeds(x: Array, y: Array, reach: float, stated: Array, near: float) -> Iter
                 if all(abs(offset - before) > 4.0 * reach for before in kept):
                     kept.append(offset)
                     yield _Seed(one, own, offset, rate)
+            if len(kept) == 1:  # it stands out
+                break
 
 
 def _shifted(x: Array, y: Array, clock: ClockMap, reach: float) -> Iterator[_Seed]:
@@ -322,7 +324,7 @@ def _peaks(
     differences: Array, reach: float, about: float = 0.0, within: float = np.inf
 ) -> Iterator[tuple[float, int]]:
     """The most frequent differences, and how many are within `reach` of each."""
-    d = np.sort(differences, axis=None)
+    d = np.sort(differences, axis=None, kind="stable")  # it joins rows that are in order
     d = d[np.abs(d - about) <= within]
     counts = np.searchsorted(d, d + 2.0 * reach, side="right") - np.arange(len(d))
     for _ in range(_CANDIDATES if len(d) else 0):
