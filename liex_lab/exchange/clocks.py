@@ -36,7 +36,7 @@ _SURE = 1e-3
 _CLOSE_S = 5e-4  # residuals below are never outliers
 _CANDIDATES = 3  # of each window
 _FINE = 0.125  # of the reach: for trains that are nearly regular
-_MOST_RATES = 40  # on either side, for the fine votes
+_MOST_RATES = 15  # on either side, for the fine votes
 _ROUNDS = 6
 _FITTED = 20_000  # events at most
 _SD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -205,7 +205,7 @@ def _check_unit(ratio: float) -> None:
         factor = _UNITS.get(unit, ratio)
         raise SyncError(
             f"the other file's times advance about {ratio:.3g} times as fast as the session's; "
-            f"times are in seconds, and these look like {unit}: divide them by {factor:.6g} or "
+            f"times are in seconds, and these may be {unit}: divide them by {factor:.6g} or "
             "by the sampling rate"
         )
     if ratio < 0.01:
@@ -234,7 +234,7 @@ def _ranked(x: Array, y: Array, reach: float, stated: Array) -> tuple[Alignment,
     """The best alignment, and the others to test it against.
 
     Raises:
-        SyncError: there is none.
+        SyncError: no alignment exists.
     """
     near = 0.5 * float(np.median(np.diff(y)))
     found: list[Alignment] = []

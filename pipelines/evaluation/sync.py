@@ -62,8 +62,8 @@ def recorded(times: Array, rng: np.random.Generator, first: bool) -> Array:
     lost[0] &= not first
     n_more = int(rng.uniform(0.0, 0.1) * len(kept))
     jitter = np.exp(rng.uniform(np.log(2e-5), np.log(2e-3)))
-    seen = kept[~lost] + rng.normal(0.0, jitter, int((~lost).sum()))
-    return np.sort(np.append(seen, rng.uniform(kept[0], kept[-1], n_more)))
+    events = kept[~lost] + rng.normal(0.0, jitter, int((~lost).sum()))
+    return np.sort(np.append(events, rng.uniform(kept[0], kept[-1], n_more)))
 
 
 def evaluate_sync(
