@@ -143,6 +143,7 @@ SYNCED = {  # on the clock of another instrument, see `sessions.clock`; by table
     name: tuple(_column(line, {}) for line in _listed()[name] if line["when"] == "synced")
     for name in ("frames", "bouts")
 }
+EVENTS = table_columns("events")  # of another instrument
 POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
@@ -154,7 +155,7 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    every = chain(*TABLES.values(), *SYNCED.values(), POINTS, branching, swimming, walking)
+    every = chain(*TABLES.values(), *SYNCED.values(), EVENTS, POINTS, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 
 

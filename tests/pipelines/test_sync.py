@@ -55,15 +55,27 @@ def session(measured: Session, tmp_path: Path) -> Session:
 
 
 def test_a_session_is_synced_corrected_and_undone(session: Session, tmp_path: Path) -> None:
+    rewards = np.arange(1.0, 7.0)
+    stated = pd.DataFrame({"event": "reward", "time_s": other_clock(rewards)})
+    stated.to_csv(tmp_path / "rewards.csv", index=False)
     arguments = ["--with", str(tmp_path / "ephys.npy"), "--pulses", str(tmp_path / "ours.csv")]
+    arguments += ["--events", str(tmp_path / "rewards.csv")]
     done = CliRunner().invoke(cli.app, ["sync", str(session.path), *arguments])
     assert done.exit_code == 0, done.output
     assert "23 events, residual 0.00 ms" in done.output
     assert "1 events of the session and 0 of ephys.npy" in done.output
+    with_events = Session.open(session.path)
+    events = with_events.table("events")
+    np.testing.assert_allclose(events["time_s"], rewards, atol=1e-5)
+    np.testing.assert_allclose(events["sync_s"], other_clock(rewards), atol=1e-9)
+    assert set(events["event"]) == {"reward"}
+    assert "About the events" in (session.path / "report.html").read_text(encoding="utf-8")
     ours = tmp_path / "ours.csv"
-    sync_session(session.path, tmp_path / "ephys.npy", pulses=ours, report=False)  # no change
+    for _ in range(2):  # the second time nothing changes
+        sync_session(session.path, tmp_path / "ephys.npy", pulses=ours, report=False)
     synced = Session.open(session.path)
-    assert len(synced.log.entries) == 1
+    assert len(synced.log.entries) == 2
+    assert not synced.has("events.parquet")
     frames, bouts = synced.frames, synced.bouts
     np.testing.assert_allclose(frames["sync_s"], other_clock(frames["time_s"]), atol=1e-5)
     np.testing.assert_allclose(bouts["sync_stop_s"], other_clock(bouts["stop_s"]), atol=1e-5)
@@ -85,7 +97,7 @@ def test_a_session_is_synced_corrected_and_undone(session: Session, tmp_path: Pa
     assert "corrected" in set(corrected.frames["flag"])
     pd.testing.assert_series_equal(corrected.frames["sync_s"], frames["sync_s"])
     assert (corrected.bouts["sync_start_s"] < corrected.bouts["sync_stop_s"]).all()
-    correct_session(session.path, undo=[1, 2], report=False)
+    correct_session(session.path, undo=[1, 2, 3], report=False)
     undone = Session.open(session.path)
     assert "sync_s" not in undone.frames
     assert "sync" not in undone.metadata
