@@ -30,6 +30,7 @@ from liex_lab.plan import Plan
 from liex_lab.runtime import durable
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, correcting, corrections, evidence, rrd
+from liex_lab.sessions.clock import fingerprint
 from liex_lab.sessions.folder import file_facts
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, frame_count
@@ -190,7 +191,13 @@ def _synchronise(raw: Session, log: corrections.Log, folder: Path) -> correction
     """Add the columns of the other clock to frames, bouts and columns.json; returns the log."""
     clock = log.clock
     assert clock is not None
-    first_ns = int(raw.table("frames", ["time_ns"])["time_ns"].iloc[0])
+    stamps = raw.table("frames", ["time_ns"])["time_ns"]
+    first_ns = int(stamps.iloc[0])
+    if fingerprint(stamps) != clock.stamps:
+        raise SessionError(
+            f"the clock of {clock.name} was aligned with other time stamps of this recording; undo "
+            "that (`liex correct undo`) and run `liex sync` again"
+        )
 
     def on_frames(block: schema.Block) -> dict[str, Any]:
         times, sd = clock.times_s(block["time_ns"])
@@ -209,8 +216,20 @@ def _synchronise(raw: Session, log: corrections.Log, folder: Path) -> correction
         part = folder / f"{name}.part"
         schema.append_columns(latest(name), part, schema.SYNCED[Path(name).stem], compute)
         part.replace(folder / name)
+    more = [column for added in schema.SYNCED.values() for column in added]
+    if clock.events:
+        names, times = zip(*sorted(clock.events, key=lambda one: one[1]), strict=True)
+        rows = {
+            "session_id": raw.name,
+            "individual": raw.metadata["individual"],
+            "event": np.array(names, object),
+            "time_s": (clock.time_ns(times) - first_ns) * 1e-9,
+            "sync_s": np.array(times),
+        }
+        schema.write_table(folder / "events.parquet", schema.EVENTS, [rows], {})
+        more += schema.EVENTS
     columns = json.loads(latest("columns.json").read_text(encoding="utf-8"))
-    columns += [asdict(column) for added in schema.SYNCED.values() for column in added]
+    columns += [asdict(column) for column in more]
     text = json.dumps(columns, indent=1, ensure_ascii=False)
     (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
     return replace(log, facts={**log.facts, "sync": clock.facts()})

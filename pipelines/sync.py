@@ -1,6 +1,8 @@
 """A session's times on the clock of another instrument: `liex sync`."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,9 +10,10 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError
 from liex_lab.exchange.clocks import Alignment, align, align_pairs, check_times
 from liex_lab.exchange.pulses import read_pulses, rises
+from liex_lab.runtime import text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
-from liex_lab.sessions.clock import ClockFit
+from liex_lab.sessions.clock import ClockFit, fingerprint
 from liex_lab.sessions.corrections import read_log
 
 from .build import open_planned
@@ -31,7 +34,9 @@ def sync_session(
     patch: Patch | None = None,
     pairs: str | Path | None = None,
     first: bool = False,
+    events: str | Path | None = None,
     author: str = "",
+    report: bool = True,
     progress: Progress = silent,
 ) -> ClockFit:
     """Put a session's times on the clock of another instrument.
@@ -52,7 +57,10 @@ def sync_session(
             a flag; of the images as recorded, and the recording is read.
         pairs: table of moments known on both clocks, columns time_s and other_s.
         first: whether the first events of both sides are the same.
+        events: table of events of the other instrument, columns event and time_s (on its clock, s);
+            they become the table `events`.
         author: author of the change; "" uses the current account.
+        report: whether to regenerate report and figures.
         progress: receives progress reports.
 
     Raises:
@@ -79,9 +87,11 @@ def sync_session(
         if first:
             stated = np.vstack([stated, [own_s[0], other_s[0]]])
         found, name = align(own_s, other_s, stated), Path(other).name
-    fit = _record(found, own_s, first_ns, name, source)
+    fit = _record(found, own_s, frames["time_ns"], name, source)
+    fit = replace(fit, events=_events_of(events))
     known = read_log(raw.path).clock == fit
-    correct_session(raw.path, () if known else (fit,), author=author, progress=progress)
+    what = () if known else (fit,)
+    correct_session(raw.path, what, author=author, report=report, progress=progress)
     return fit
 
 
@@ -91,6 +101,20 @@ def _stated(pairs: str | Path | None) -> Array:
         return np.zeros((0, 2))
     columns = [read_pulses(pairs, name) for name in ("time_s", "other_s")]
     return np.stack(columns, axis=-1)
+
+
+def _events_of(path: str | Path | None) -> tuple[tuple[str, float], ...]:
+    """Names and times, s, of a table of events; none without a file."""
+    if path is None:
+        return ()
+    times = read_pulses(path, "time_s")
+    names = text_files.read_texts(Path(path)).get("event")
+    if names is None or not len(times) or not np.isfinite(times).all():
+        raise SessionError(
+            f"{path} should hold events, a row each, with their name (column event) and time in "
+            "seconds (column time_s)"
+        )
+    return tuple(zip(map(str, names), times.tolist(), strict=True))
 
 
 def _own_events(
@@ -126,8 +150,8 @@ def _own_events(
     return 0.5 * (times[rows - 1] + times[rows]), f"pixels {','.join(map(str, patch))}"
 
 
-def _record(found: Alignment, own_s: Array, first_ns: int, name: str, source: str) -> ClockFit:
-    """The record of an alignment in the session's log."""
+def _record(found: Alignment, own_s: Array, time_ns: Any, name: str, source: str) -> ClockFit:
+    """The record of an alignment in the log of a session with these time stamps."""
     clock, m = found.clock, len(found.pairs)
     sd_s = clock.sd_s.tolist() if np.isfinite(clock.sd_s).all() else None
     times = own_s[found.pairs[:, 0]]
@@ -139,9 +163,10 @@ def _record(found: Alignment, own_s: Array, first_ns: int, name: str, source: st
     return ClockFit(
         name,
         source,
-        tuple((first_ns + np.rint(1e9 * clock.own_s).astype(np.int64)).tolist()),
+        tuple((int(time_ns.iloc[0]) + np.rint(1e9 * clock.own_s).astype(np.int64)).tolist()),
         tuple(clock.other_s.tolist()),
         None if sd_s is None else tuple(sd_s),
+        fingerprint(time_ns),
         m,
         (alone[0], alone[1]),
         round(1e3 * found.rms_s, 4),

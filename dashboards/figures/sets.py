@@ -40,6 +40,7 @@ OF_SESSION: dict[str, tuple[str, Callable[[SessionAnimal], Figure | None]]] = {
     "activity": ("shares of the actions over the session", times.activity),
     "transitions": ("what follows upon what, against chance", times.transitions),
     "onsets": ("measures about the onsets of actions", times.aligned_curves),
+    "events": ("measures about events of another instrument", times.event_curves),
     "distance": ("distance summed up over the session", times.cumulative_distance),
     "speed": ("share of the time at each speed", times.speed_distribution),
     "error": ("share of the time at each predicted error", times.error_distribution),

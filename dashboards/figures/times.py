@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Rectangle
@@ -39,6 +40,7 @@ from .style import (
 
 _MOST_COLUMNS = 1200  # of a curve; more points cannot be distinguished on a page
 _CURVE_MM = 17.0
+_MOST_EVENTS = 12  # names of events
 _SMALL_BOX = (12.0, 9.0, ONE_COLUMN_MM - 17.0, 33.0)
 _BESIDE_S = 0.2  # margin of a stretch, so that its curves reach its ends
 
@@ -526,10 +528,26 @@ def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[
 
 def aligned_curves(animal: SessionAnimal) -> Figure | None:
     """Median and quartiles of measures around the onsets of actions; None with too few bouts."""
-    rows = _onsets(animal)
+    about = "the onsets", "the bouts"
+    return _aligned(animal, animal.bouts, action_colours(animal.words), about)
+
+
+def event_curves(animal: SessionAnimal) -> Figure | None:
+    """The same around events of another instrument; None with too few of each name."""
+    events = animal.table("events")
+    if events is None:
+        return None
+    colours = dict.fromkeys(events["event"].astype(str).unique()[:_MOST_EVENTS], BLUE)
+    named = events.rename(columns={"event": "action", "time_s": "start_s"})
+    return _aligned(animal, named, colours, ("the events", "the events"))
+
+
+def _aligned(
+    animal: SessionAnimal, bouts: pd.DataFrame, colours: dict[str, str], about: tuple[str, str]
+) -> Figure | None:
+    rows = _onsets(animal, bouts, list(colours))
     if not rows:
         return None
-    colours = action_colours(animal.words)
     side = (TWO_COLUMNS_MM - 4.0) / _BESIDE
     lines = -(-len(rows) // _BESIDE)
     figure = sheet(TWO_COLUMNS_MM, lines * 33.0 + 9.0)
@@ -551,12 +569,14 @@ def aligned_curves(animal: SessionAnimal) -> Figure | None:
         axes.set_title(f"{word.replace('_', ' ')}, n = {one.n}", size=6.5)
         axes.set_ylabel(f"{title.lower()}, {unit}")
         if line == lines - 1 or k + _BESIDE >= len(rows):
-            axes.set_xlabel("time from the onset, s")
-    heading(figure, f"About the onsets, {animal.label}: median and quartiles over the bouts")
+            axes.set_xlabel("time from the onset, s" if bouts is animal.bouts else "time, s")
+    heading(figure, f"About {about[0]}, {animal.label}: median and quartiles over {about[1]}")
     return figure
 
 
-def _onsets(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
+def _onsets(
+    animal: SessionAnimal, bouts: pd.DataFrame, words: list[str]
+) -> list[tuple[str, str, str, Around]]:
     """(measure, unit, word, curves) of every action with enough bouts, in the displayed unit."""
     found: list[tuple[str, str, str, Around]] = []
     moved = animal.kinematics
@@ -567,10 +587,10 @@ def _onsets(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
         for one in drawn_curves(animal)
         if one.column in ("speed_mm_s", "nose_height_mm", "tail_beat_hz", "opening")
     ):
-        for word in animal.words:
-            if curve.column == "nose_height_mm" and not word.startswith("rear"):
+        for word in words:
+            if curve.column == "nose_height_mm" and word in animal.words and word[:4] != "rear":
                 continue  # constant without rearing
-            one = around_onsets(moved, animal.bouts, word, curve.column)
+            one = around_onsets(moved, bouts, word, curve.column)
             if one is not None:
                 low, median, high = (
                     shown(some, curve.unit)[0] for some in (one.low, one.median, one.high)

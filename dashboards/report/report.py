@@ -213,7 +213,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 _TABLES = (
     *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
-    *("summary", "transitions", "activity", "zones"),
+    *("summary", "transitions", "activity", "zones", "events"),
 )
 
 

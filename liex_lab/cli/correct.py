@@ -258,6 +258,14 @@ def sync(
     first: Annotated[
         bool, typer.Option("--first", help="The first pulses of both sides are the same.")
     ] = False,
+    events: Annotated[
+        Path | None,
+        typer.Option(
+            "--events",
+            metavar="CSV",
+            help="Events of the other instrument, columns event and time_s, for the table events.",
+        ),
+    ] = None,
     by: Author = "",
 ) -> None:
     """Put a session's times on the clock of another instrument, by pulses that both recorded."""
@@ -274,6 +282,7 @@ def sync(
             patch=(left, top, right, bottom) if patch else None,
             pairs=pairs,
             first=first,
+            events=events,
             author=by,
             progress=progress,
         )

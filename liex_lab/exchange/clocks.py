@@ -36,7 +36,7 @@ _SURE = 1e-3
 _CLOSE_S = 5e-4  # residuals below are never outliers
 _CANDIDATES = 3  # of each window
 _FINE = 0.125  # of the reach: for trains that are nearly regular
-_MOST_RATES = 40  # on either side, for the fine votes
+_MOST_RATES = 15  # on either side, for the fine votes
 _ROUNDS = 6
 _FITTED = 20_000  # events at most
 _SD = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
@@ -205,7 +205,7 @@ def _check_unit(ratio: float) -> None:
         factor = _UNITS.get(unit, ratio)
         raise SyncError(
             f"the other file's times advance about {ratio:.3g} times as fast as the session's; "
-            f"times are in seconds, and these look like {unit}: divide them by {factor:.6g} or "
+            f"times are in seconds, and these may be {unit}: divide them by {factor:.6g} or "
             "by the sampling rate"
         )
     if ratio < 0.01:
@@ -234,7 +234,7 @@ def _ranked(x: Array, y: Array, reach: float, stated: Array) -> tuple[Alignment,
     """The best alignment, and the others to test it against.
 
     Raises:
-        SyncError: there is none.
+        SyncError: no alignment exists.
     """
     near = 0.5 * float(np.median(np.diff(y)))
     found: list[Alignment] = []
@@ -276,7 +276,7 @@ def _seeds(x: Array, y: Array, reach: float, stated: Array, near: float) -> Iter
     for one, (own, other, within) in zip(rows, about, strict=True):
         window = x[one] - own
         fine = max(_FINE * reach, MOST_DRIFT * float(np.ptp(window)) / (3.0 * _MOST_RATES))
-        for near_s in {reach, min(fine, reach)}:
+        for near_s in (reach, min(fine, reach)):
             step = 3.0 * near_s / float(np.ptp(window))
             n = int(MOST_DRIFT / step)
             votes = [
@@ -291,6 +291,8 @@ def _seeds(x: Array, y: Array, reach: float, stated: Array, near: float) -> Iter
                 if all(abs(offset - before) > 4.0 * reach for before in kept):
                     kept.append(offset)
                     yield _Seed(one, own, offset, rate)
+            if len(kept) == 1:  # it stands out
+                break
 
 
 def _shifted(x: Array, y: Array, clock: ClockMap, reach: float) -> Iterator[_Seed]:
@@ -322,7 +324,7 @@ def _peaks(
     differences: Array, reach: float, about: float = 0.0, within: float = np.inf
 ) -> Iterator[tuple[float, int]]:
     """The most frequent differences, and how many are within `reach` of each."""
-    d = np.sort(differences, axis=None)
+    d = np.sort(differences, axis=None, kind="stable")  # it joins rows that are in order
     d = d[np.abs(d - about) <= within]
     counts = np.searchsorted(d, d + 2.0 * reach, side="right") - np.arange(len(d))
     for _ in range(_CANDIDATES if len(d) else 0):

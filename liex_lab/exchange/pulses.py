@@ -103,7 +103,7 @@ def _csv(path: Path, channel: str) -> Any:
 
 
 def _number(text: str) -> float | None:
-    """A cell as a number, with a decimal point or comma; None if it is none."""
+    """A cell as a number, with a decimal point or comma; None for any other."""
     try:
         return float(text.replace(",", "."))
     except ValueError:

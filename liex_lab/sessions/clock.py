@@ -1,5 +1,6 @@
 """The clock of another instrument: a map of times, and its record in the log of a session."""
 
+import hashlib
 from dataclasses import asdict
 from dataclasses import dataclass as plain_dataclass
 from typing import Any, Literal
@@ -47,6 +48,11 @@ class ClockMap:
         )
 
 
+def fingerprint(time_ns: Any) -> str:
+    """The first 16 hexadecimal digits of the SHA-256 of a recording's time stamps (n,), ns."""
+    return hashlib.sha256(np.asarray(time_ns, "<i8").tobytes()).hexdigest()[:16]
+
+
 @dataclass(frozen=True)
 class ClockFit:
     """The session's times are put on the clock of another instrument.
@@ -57,12 +63,14 @@ class ClockFit:
         own_ns: (k,) knots on the recording's clock, ns.
         other_s: (k,) the same moments on the other clock, s.
         sd_s: (k,) standard error of `other_s`, s; None if unknown.
+        stamps: fingerprint of the recording's time stamps, see `fingerprint`.
         n_matched: events that agree.
         n_unmatched: events of the session and of the other file without a partner, where both
             recorded.
         rms_ms: root mean square of the residuals, ms.
         residuals: moments, s since the first frame, and residuals there, ms; at most 400 of them,
             with the extremes.
+        events: names of events and their times on the other clock, s.
     """
 
     name: str
@@ -70,10 +78,12 @@ class ClockFit:
     own_ns: tuple[int, ...]
     other_s: tuple[float, ...]
     sd_s: tuple[float, ...] | None
+    stamps: str
     n_matched: int
     n_unmatched: tuple[int, int]
     rms_ms: float
     residuals: tuple[tuple[float, float], ...] = ()
+    events: tuple[tuple[str, float], ...] = ()
     kind: Literal["clock"] = "clock"
 
     def __post_init__(self) -> None:
@@ -87,14 +97,24 @@ class ClockFit:
             f"{self.rms_ms:.2f} ms"
         )
 
-    def times_s(self, time_ns: Any) -> tuple[Array, Array]:
-        """Times of the recording's clock, ns, on the other one, and their standard errors, s."""
+    @property
+    def clock(self) -> ClockMap:
+        """The map from seconds since the first knot to the other clock."""
         own = (np.array(self.own_ns) - self.own_ns[0]) * 1e-9
         sd = np.full(len(own), np.nan) if self.sd_s is None else np.array(self.sd_s)
-        clock = ClockMap(own, np.array(self.other_s), sd)
+        return ClockMap(own, np.array(self.other_s), sd)
+
+    def times_s(self, time_ns: Any) -> tuple[Array, Array]:
+        """Times of the recording's clock, ns, on the other one, and their standard errors, s."""
         times = (np.asarray(time_ns, np.int64) - self.own_ns[0]) * 1e-9
-        return clock(times), clock.sd(times)
+        return self.clock(times), self.clock.sd(times)
+
+    def time_ns(self, times_s: Any) -> NDArray[np.int64]:
+        """Times of the other clock, s, on the recording's one, ns."""
+        forth = self.clock
+        back = ClockMap(forth.other_s, forth.own_s, forth.sd_s)
+        return self.own_ns[0] + np.rint(1e9 * back(times_s)).astype(np.int64)
 
     def facts(self) -> dict[str, Any]:
         """Section `sync` of session.json."""
-        return {name: value for name, value in asdict(self).items() if name != "kind"}
+        return {k: value for k, value in asdict(self).items() if k not in ("kind", "events")}

@@ -145,6 +145,7 @@ SYNCED = {  # on the clock of another instrument, see `sessions.clock`; by table
 }
 # of sessions with several animals in one arena only
 INTERACTIONS = table_columns("interactions") + table_columns("interaction_totals")
+EVENTS = table_columns("events")  # of another instrument
 POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
@@ -156,9 +157,8 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    every = chain(
-        *TABLES.values(), *SYNCED.values(), INTERACTIONS, POINTS, branching, swimming, walking
-    )
+    tables = chain(*TABLES.values(), *SYNCED.values(), INTERACTIONS, EVENTS, POINTS)
+    every = chain(tables, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 
 

@@ -16,12 +16,12 @@ from liex_lab.runtime.progress import Progress, silent
 PROTOCOL = (
     "trains of 5 to 60 minutes: regular (0.5 to 5 s), random intervals (0.5 to 1.5 times a mean of "
     "0.5 to 5 s), barcodes (a counter of 32 bits of 30 ms every 10 to 30 s), regular with the "
-    "first event stated as common, unrelated trains of random intervals; clocks offset by up to "
-    "10,000 s, rates apart by up to 200 ppm and an oscillation of up to 20 ppm in 20 to 60 min; on "
-    "each side jitter of 0.02 to 2 ms (SD), 0 to 10 % of the events lost and 0 to 10 % added, and "
-    "up to 20 % cut off at each end"
+    "first event stated as common, nearly regular (intervals that vary by 0.03 to 5 %), and "
+    "unrelated trains of random intervals; clocks offset by up to 10,000 s, rates apart by up to "
+    "200 ppm and an oscillation of up to 20 ppm in 20 to 60 min; on each side jitter of 0.02 to 2 "
+    "ms (SD), 0 to 10 % of the events lost and 0 to 10 % added, and up to 20 % cut off at each end"
 )
-KINDS = ("regular", "random", "barcode", "regular_first_stated", "unrelated")
+KINDS = ("regular", "random", "barcode", "regular_first_stated", "nearly_regular", "unrelated")
 _WRONG_S = 0.01  # an alignment that is off by more, in the median, is wrong; so is any of unrelated
 Array = NDArray[np.float64]
 
@@ -41,6 +41,8 @@ def base_train(kind: str, duration_s: float, rng: np.random.Generator) -> Array:
         return np.sort((starts[:, None] + 0.03 * np.arange(levels.shape[1]))[rises])
     mean = rng.uniform(0.5, 5.0)
     spread = 0.0 if kind.startswith("regular") else 0.5
+    if kind == "nearly_regular":
+        spread = np.exp(rng.uniform(np.log(3e-4), np.log(0.05)))
     steps = mean * rng.uniform(1.0 - spread, 1.0 + spread, int(2.0 * duration_s / mean) + 1)
     times = np.cumsum(steps)
     return times[times < duration_s]
@@ -60,8 +62,8 @@ def recorded(times: Array, rng: np.random.Generator, first: bool) -> Array:
     lost[0] &= not first
     n_more = int(rng.uniform(0.0, 0.1) * len(kept))
     jitter = np.exp(rng.uniform(np.log(2e-5), np.log(2e-3)))
-    seen = kept[~lost] + rng.normal(0.0, jitter, int((~lost).sum()))
-    return np.sort(np.append(seen, rng.uniform(kept[0], kept[-1], n_more)))
+    events = kept[~lost] + rng.normal(0.0, jitter, int((~lost).sum()))
+    return np.sort(np.append(events, rng.uniform(kept[0], kept[-1], n_more)))
 
 
 def evaluate_sync(
@@ -70,7 +72,7 @@ def evaluate_sync(
     """Error of aligned clocks, and how many were refused; `liex evaluate sync`.
 
     Args:
-        n_pairs: simulated pairs of clocks, a fifth of each kind.
+        n_pairs: simulated pairs of clocks, a sixth of each kind.
         seed: of the simulation.
         progress: called pair by pair.
 

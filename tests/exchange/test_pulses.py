@@ -117,7 +117,8 @@ def test_edges_of_spikeglx_are_read(tmp_path: Path) -> None:
 
 
 def test_edges_of_a_harp_register_are_read(tmp_path: Path) -> None:
-    register: Any = RegisterU8(32)
+    native: Any = RegisterU8
+    register = native(32)
     values = np.array([1, 0, 3, 0, 1, 0], np.uint8)
     harp.data.to_file(register, values, tmp_path / "Inputs_32.bin", timestamps=EDGES)
     np.testing.assert_allclose(read_pulses(tmp_path / "Inputs_32.bin", "0"), EDGES[::2])

@@ -9,6 +9,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pynwb
 import pytest
+from liex_lab.pipelines import sync
 from liex_lab.pipelines.correct import correct_session
 from liex_lab.pipelines.sync import sync_session
 from liex_lab.pipelines.verify import verify_session
@@ -18,6 +19,7 @@ from liex_lab import cli
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.exchange import export
 from liex_lab.plan import Plan
+from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import Session, correcting
 from tests.sessions.walking_mouse import WalkingMouse, write
 
@@ -53,14 +55,27 @@ def session(measured: Session, tmp_path: Path) -> Session:
 
 
 def test_a_session_is_synced_corrected_and_undone(session: Session, tmp_path: Path) -> None:
+    rewards = np.arange(1.0, 7.0)
+    stated = pd.DataFrame({"event": "reward", "time_s": other_clock(rewards)})
+    stated.to_csv(tmp_path / "rewards.csv", index=False)
     arguments = ["--with", str(tmp_path / "ephys.npy"), "--pulses", str(tmp_path / "ours.csv")]
-    for _ in range(2):  # again changes nothing
-        done = CliRunner().invoke(cli.app, ["sync", str(session.path), *arguments])
-        assert done.exit_code == 0, done.output
-        assert "23 events, residual 0.00 ms" in done.output
-        assert "1 events of the session and 0 of ephys.npy" in done.output
+    arguments += ["--events", str(tmp_path / "rewards.csv")]
+    done = CliRunner().invoke(cli.app, ["sync", str(session.path), *arguments])
+    assert done.exit_code == 0, done.output
+    assert "23 events, residual 0.00 ms" in done.output
+    assert "1 events of the session and 0 of ephys.npy" in done.output
+    with_events = Session.open(session.path)
+    events = with_events.table("events")
+    np.testing.assert_allclose(events["time_s"], rewards, atol=1e-5)
+    np.testing.assert_allclose(events["sync_s"], other_clock(rewards), atol=1e-9)
+    assert set(events["event"]) == {"reward"}
+    assert "About the events" in (session.path / "report.html").read_text(encoding="utf-8")
+    ours = tmp_path / "ours.csv"
+    for _ in range(2):  # the second time nothing changes
+        sync_session(session.path, tmp_path / "ephys.npy", pulses=ours, report=False)
     synced = Session.open(session.path)
-    assert len(synced.log.entries) == 1
+    assert len(synced.log.entries) == 2
+    assert not synced.has("events.parquet")
     frames, bouts = synced.frames, synced.bouts
     np.testing.assert_allclose(frames["sync_s"], other_clock(frames["time_s"]), atol=1e-5)
     np.testing.assert_allclose(bouts["sync_stop_s"], other_clock(bouts["stop_s"]), atol=1e-5)
@@ -82,7 +97,7 @@ def test_a_session_is_synced_corrected_and_undone(session: Session, tmp_path: Pa
     assert "corrected" in set(corrected.frames["flag"])
     pd.testing.assert_series_equal(corrected.frames["sync_s"], frames["sync_s"])
     assert (corrected.bouts["sync_start_s"] < corrected.bouts["sync_stop_s"]).all()
-    correct_session(session.path, undo=[1, 2], report=False)
+    correct_session(session.path, undo=[1, 2, 3], report=False)
     undone = Session.open(session.path)
     assert "sync_s" not in undone.frames
     assert "sync" not in undone.metadata
@@ -90,7 +105,7 @@ def test_a_session_is_synced_corrected_and_undone(session: Session, tmp_path: Pa
 
 def test_frames_are_pulses_when_the_first_one_is_stated(session: Session, tmp_path: Path) -> None:
     np.save(tmp_path / "exposures.npy", other_clock(np.arange(240) / 30.0))
-    fit = sync_session(session.path, tmp_path / "exposures.npy", first=True)
+    fit = sync_session(session.path, tmp_path / "exposures.npy", first=True, report=False)
     assert fit.n_matched == 234
     assert fit.n_unmatched == (0, 6)
     frames = Session.open(session.path).frames
@@ -99,7 +114,7 @@ def test_frames_are_pulses_when_the_first_one_is_stated(session: Session, tmp_pa
 
 def test_stated_pairs_suffice(session: Session, tmp_path: Path) -> None:
     (tmp_path / "pairs.csv").write_text("time_s;other_s\n1,0;11,0\n7,0;17,0\n")
-    assert sync_session(session.path, pairs=tmp_path / "pairs.csv").sd_s is None
+    assert sync_session(session.path, pairs=tmp_path / "pairs.csv", report=False).sd_s is None
     frames = Session.open(session.path).frames
     np.testing.assert_allclose(frames["sync_s"], frames["time_s"] + 10.0)
     assert frames["sync_sd_ms"].isna().all()
@@ -113,3 +128,25 @@ def test_a_session_is_whole_if_it_is_not_synced(session: Session, tmp_path: Path
     with pytest.raises(LiexError, match=r"fit nowhere|more than one way"):
         sync_session(session.path, tmp_path / "other.npy", pulses=tmp_path / "ours.csv")
     assert sorted(path.name for path in session.path.iterdir()) == before
+
+
+def test_a_blinking_patch_of_the_recording_gives_the_pulses(
+    session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(row: int) -> np.ndarray:
+        image = np.full((80, 107), 700.0, np.float32)
+        if ((MOUSE.times_s[row] >= PULSES) & (MOUSE.times_s[row] < PULSES + 0.08)).any():
+            image[2:6, 3:9] = 0.0  # the LED blinds the camera
+        return image
+
+    images = Recording(
+        name="circle", format="images", camera=MOUSE.camera, times_ns=MOUSE.times_ns, read=read
+    )
+    monkeypatch.setattr(sync, "recording_of", lambda *_: images)
+    fit = sync_session(session.path, tmp_path / "ephys.npy", patch=(2, 1, 10, 7), report=False)
+    assert fit.n_matched >= 20
+    assert fit.rms_ms < 20.0  # of frames every 33 ms
+    frames = Session.open(session.path).frames
+    np.testing.assert_allclose(frames["sync_s"], other_clock(frames["time_s"]), atol=0.015)
+    with pytest.raises(SessionError, match=r"LEFT,TOP,RIGHT,BOTTOM in pixels .* of 107 x 80"):
+        sync_session(session.path, tmp_path / "ephys.npy", patch=(2, 1, 200, 7))
