@@ -1,15 +1,20 @@
-"""Measurement of several arenas in one recording: a session per arena, in one pass.
+"""Measurement of several arenas, or several animals, in one recording: a session each, in one pass.
 
 Each frame is decoded once; every arena's pipeline gets it with all pixels outside the arena's
 region unread. The arenas are otherwise independent: each has its own background, floor, size,
 track, checkpoint and folder, NAME-ARENA.liex, and its tables are byte-identical to those of a run
 with that region alone. If one arena fails, the others continue.
+
+Several animals in one arena (`animal.count`) share its background and floor, and every frame is
+measured for all of them at once (`tracking.joint`). At the end their identities are decided over
+the whole recording (`tracking.identity`), and each animal's session, NAME-animalK.liex, is finished
+as that of a single animal is.
 """
 
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,19 +30,22 @@ from liex_lab.recordings.timestamps import unwritable_times
 from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, reporting_compilation, silent
 from liex_lab.scene.zones import masks_apart
+from liex_lab.tracking.identity import identify, own_observations
+from liex_lab.tracking.joint import JointTracker
+from liex_lab.tracking.observations import Observations
 
-from .build import arenas_of, build_recording, stated_corners
+from .build import arenas_of, build_joint_tracker, build_recording, stated_corners
 from .choice import USUAL, fit_plan
 from .compiling import compile_ahead
-from .session import HEAVY, MEASURING, Prepared, check_unused, prepare, read_ahead
+from .session import HEAVY, MEASURING, Prepared, check_unused, prepare, read_ahead, run_session
 
 
 @dataclass(frozen=True)
 class ArenaOutcome:
-    """Result of one arena.
+    """Result of one arena, or of one of several animals.
 
     Attributes:
-        name: of the arena.
+        name: of the arena or animal.
         session: its session folder; None if it could not be measured.
         error: why it could not be measured; None if it was.
     """
@@ -60,12 +68,12 @@ def run_arenas(
     report: bool = True,
     progress: Progress = silent,
 ) -> list[ArenaOutcome]:
-    """Measure several arenas in one image, each as a separate session, in one pass.
+    """Measure several arenas in one image, or several animals in one arena, a session each.
 
     Args:
         recording: path of a recording, address of a virtual one, or an open recording.
-        plan: lists `[[arenas]]`, or has `arenas = "auto"`; None selects the bundled plan that fits
-            each arena, with the arenas in `settings`.
+        plan: lists `[[arenas]]`, has `arenas = "auto"`, or states `animal.count`; None selects the
+            bundled plan that fits each arena, with the arenas in `settings`.
         out: parent of the session folders `<recording's name>-<arena>.liex`.
         settings: overrides when no plan is given.
         overwrite: replace existing sessions.
@@ -83,6 +91,10 @@ def run_arenas(
         LiexError: the recording or the plan cannot be used, or arenas overlap.
     """
     first = plan or Plan.load(USUAL).with_settings(settings)
+    if first.arenas is None:
+        return _run_animals(
+            recording, plan, first, Path(out), settings, overwrite, notes, report, progress
+        )
     pool = pool or processes.processes_for(workers or 1)
     outcomes: dict[str, ArenaOutcome] = {}
     with (
@@ -160,6 +172,100 @@ def _measure(
         return {
             name: prepared.finish(writers[name], recording, notes).path
             for name, prepared in going.items()
+        }
+
+
+def _run_animals(
+    recording: str | Path | Recording,
+    plan: Plan | None,
+    first: Plan,
+    out: Path,
+    settings: Sequence[str],
+    overwrite: bool,
+    notes: Mapping[str, Any] | None,
+    report: bool,
+    progress: Progress,
+) -> list[ArenaOutcome]:
+    """Measure the animals of one arena, see `run_arenas`; `first` is the plan with its settings."""
+    started = time.perf_counter()
+    with (
+        processes.imported_ahead(*HEAVY),
+        reporting_compilation(progress) as progress,
+        build_recording(recording, first, progress) as opened,
+    ):
+        if problem := unwritable_times(opened.times_ns):
+            raise RecordingError(f"of {opened.name} {problem}")
+        compile_ahead(first.animal.skeleton, progress=progress)
+        progress(0, None, "learning the background, the floor and the animals' sizes")
+        fitted = fit_plan(opened, first, settings=None if plan else settings, progress=progress)
+        count = fitted.plan.animal.count
+        count = fitted.tracker.scene.n_animals if count == "auto" else count
+        going: dict[str, Prepared] = {}
+        if count > 1:
+            joint = build_joint_tracker(fitted.recording, fitted.plan, fitted.tracker, count)
+            name = fitted.plan.session.name or opened.name
+            folders = [durable.inside(out, f"{name}-animal{k + 1}", ".liex") for k in range(count)]
+            for folder in folders:
+                check_unused(folder, overwrite)
+            for k, (tracker, folder) in enumerate(zip(joint.trackers, folders, strict=True), 1):
+                stated = [
+                    f"session.name={toml_value(folder.stem)}",
+                    f"session.individual=animal{k}",
+                ]
+                own = replace(fitted, plan=fitted.plan.with_settings(stated), tracker=tracker)
+                going[f"animal{k}"] = prepare(own, folder, started, progress)
+            sessions = _measure_animals(going, joint, recording, overwrite, notes, report, progress)
+            return [ArenaOutcome(name, session) for name, session in sessions.items()]
+    alone = ["animal.count=1"]
+    session = run_session(
+        recording,
+        plan and plan.with_settings(alone),
+        out,
+        settings=[*settings, *alone],
+        overwrite=overwrite,
+        notes=notes,
+        report=report,
+        progress=progress,
+    )
+    return [ArenaOutcome("animal1", session)]
+
+
+def _measure_animals(
+    going: Mapping[str, Prepared],
+    joint: JointTracker,
+    recording: str | Path | Recording,
+    overwrite: bool,
+    notes: Mapping[str, Any] | None,
+    report: bool,
+    progress: Progress,
+) -> dict[str, Path]:
+    """Measure all frames for all animals, decide their identities, and finish the sessions."""
+    with ExitStack() as stack:
+        writers = [
+            stack.enter_context(prepared.writing(overwrite, report)) for prepared in going.values()
+        ]
+        shared = next(iter(going.values())).recording
+        with closing(read_ahead(shared, min(writer.n_frames for writer in writers))) as chunks:
+            for frames in chunks:
+                for writer, seen in zip(writers, joint.observe(frames), strict=True):
+                    left = slice(max(0, writer.n_frames - frames[0].index), None)
+                    writer.add(frames[left], observations=seen[left])
+                progress(frames[-1].index + 1, len(shared), MEASURING)
+        whole = [writer.observations(Observations) for writer in writers]
+        subjects = [prepared.fitted.tracker.subject for prepared in going.values()]
+        areas = [prepared.fitted.tracker.scene.area_mm2 for prepared in going.values()]
+        identity = identify(whole, subjects, areas)
+        return {
+            name: prepared.finish(
+                writer,
+                recording,
+                notes,
+                own_observations(observed, identity.slots[:, k]),
+                [one for one in identity.crossings if k in one.animals],
+            ).path
+            for k, ((name, prepared), writer, observed) in enumerate(
+                zip(going.items(), writers, whole, strict=True)
+            )
         }
 
 

@@ -37,6 +37,7 @@ from liex_lab.scene.floor import Floor
 from liex_lab.scene.scene import UNKNOWN, Arena, find_arena, plane_of
 from liex_lab.scene.zones import Corners, DrawnZone, Zone, read_zones, region_corners_px
 from liex_lab.sessions import Provenance, cutouts
+from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.own_shape import StatedShape
 from liex_lab.tracking.tracker import FrameTracker
 
@@ -471,6 +472,29 @@ def build_tracker(
         adapt=plan.estimation.adapt == "auto",
         stated=build_stated_shape(plan, estimator.skeleton),
     )
+
+
+def build_joint_tracker(
+    recording: Recording, plan: Plan, alone: FrameTracker, n_animals: int
+) -> JointTracker:
+    """The tracker of several animals in one arena.
+
+    Args:
+        recording: an open recording.
+        plan: states the number of sampled frames.
+        alone: the tracker of one of the animals.
+        n_animals: how many are measured.
+
+    Raises:
+        EstimationError: fewer animals stand apart in all sampled frames.
+    """
+    stride = (
+        alone.scene.stride
+        if isinstance(alone.scene, background_segmenter.BackgroundSubtraction)
+        else 1
+    )
+    sample = background.sample_frames(recording, plan.foreground.n_background_frames, stride)
+    return JointTracker.prepare(alone, sample, n_animals)
 
 
 def build_stated_shape(plan: Plan, skeleton: Skeleton) -> StatedShape | None:

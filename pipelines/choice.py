@@ -107,7 +107,7 @@ def propose_plan(recording: Recording, plan: Plan | None = None) -> Proposal:
     if fit.n_animals > 1:
         problems.append(
             f"{fit.n_animals} animals are in view at once and a run follows one of them, whose "
-            "poses are then not trusted; record them one at a time"
+            "poses are then not trusted; measure them all with --set animal.count=auto"
         )
     given_fits = plan is not None and found is first
     return Proposal(found.name, summary, fit.n_animals, tuple(problems), given_fits)

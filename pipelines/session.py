@@ -65,7 +65,7 @@ from liex_lab.sessions.writer import (
 )
 from liex_lab.tables.rows import Rows, bout_rows
 from liex_lab.tables.schema import BOUTS, empty_table
-from liex_lab.tracking import curve, observations, trust
+from liex_lab.tracking import curve, identity, observations, trust
 from liex_lab.tracking.tracker import FrameTracker
 
 from .build import (
@@ -314,6 +314,11 @@ def run_session(
             "the plan lists several arenas, each of which becomes a session of its own; measure "
             "them with `liex run`, or in Python with run_arenas"
         )
+    if first.animal.count != 1:
+        raise PlanError(
+            "the plan states several animals (animal.count), each of which becomes a session of "
+            "its own; measure them with `liex run`, or in Python with run_arenas"
+        )
     with (
         processes.imported_ahead(*HEAVY),
         reporting_compilation(progress) as progress,
@@ -465,6 +470,8 @@ class Prepared:
         writer: SessionWriter,
         source: str | Path | Recording,
         notes: Mapping[str, Any] | None = None,
+        observed: observations.Observations | None = None,
+        crossings: Sequence[identity.Crossing] = (),
     ) -> Session:
         """Make track, behaviour and tables, and move the session to its folder.
 
@@ -473,9 +480,11 @@ class Prepared:
             source: path or address of the recording, to which the session links; there is no link
                 to an open recording.
             notes: additional contents of session.json.
+            observed: the observations of this animal; None uses those that the writer has.
+            crossings: in which it may have been exchanged with another one.
         """
         began = time.perf_counter()
-        verdict = make_track(writer, self.fitted)
+        verdict = make_track(writer, self.fitted, observed, crossings)
         self.timings["track"] += time.perf_counter() - began
         if isinstance(source, str | Path):
             writer.note(input=evidence.link_to(source, self.folder))
@@ -520,15 +529,27 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[frame.DepthFrame
     yield from chunks if opened.format == "synthetic" else processes.prefetch(chunks)
 
 
-def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
+def make_track(
+    writer: SessionWriter,
+    fitted: Fitted,
+    observed: observations.Observations | None = None,
+    crossings: Sequence[identity.Crossing] = (),
+) -> Verdict:
     """Make the track of a session whose frames have all been measured, and pass it to the writer.
+
+    Args:
+        writer: has all frames.
+        fitted: plan, recording and tracker.
+        observed: the observations of the animal; None uses those that the writer has.
+        crossings: in which it may have been exchanged with another one.
 
     Returns:
         The verdict on the session.
     """
     tracker = fitted.tracker
-    whole = writer.observations(observations.Observations)
+    whole = observed or writer.observations(observations.Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
+    identity.flag_unclear(tracked.track, crossings)
     subject = tracker.subject
     recording = fitted.recording
     fast = trust.why_too_fast(tracked.track, subject.length_mm)
@@ -548,7 +569,7 @@ def make_track(writer: SessionWriter, fitted: Fitted) -> Verdict:
             *tracker.scene.doubts,
             *recording.doubts,
             *recording.clock_doubts,
-            *filter(None, [fast, centre if at_edge else ""]),
+            *filter(None, [fast, centre if at_edge else "", identity.doubt(crossings)]),
             *frozen,
             *recording.files.rewritten(),
         ),

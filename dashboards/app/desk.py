@@ -259,7 +259,8 @@ def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretc
                 f"{one.individual} and {other.individual}",
                 "perhaps exchanged",
             )
-    if len(animals) == 1 and (session.metadata.get("verdict") or {}).get("n_animals", 1) > 1:
+    verdict = session.metadata.get("verdict") or {}
+    if len(animals) == 1 and verdict.get("n_animals", 1) > verdict.get("n_measured", 1):
         centres = evidence.read_centres(session)
         if centres is not None:
             away_mm = np.linalg.norm(centres[:, 1] - centres[:, 0], axis=1)

@@ -86,7 +86,7 @@ def warnings(session: Session) -> list[str]:
         counted=counted,
         shown=shown,
         frames=frames,
-        n_animals=int((about.get("verdict") or {}).get("n_animals", 1)),
+        n_beside=_unmeasured(about),
         hidden=hidden,
         lost=frames["n_frames"] - frames["n_observed"] - hidden,
         doubtful=int(frames["flags"].get("doubtful", 0)),
@@ -268,7 +268,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         flips=likely.to_dict("records"),
         thumbnails=thumbnails(session),
         whole_image=whole_image(session),
-        n_animals=(about.get("verdict") or {}).get("n_animals", 1),
+        n_animals=_unmeasured(about) + 1,
         no_pose=vocabulary.NO_POSE,
         top_mm=scale_mm([session]),
         last_joint=about["animal"]["joints"][-1].replace("_", " "),
@@ -292,6 +292,12 @@ def render(session: Session, figures: Path | None = None) -> str:
         methods=methods(session),
         glossary=glossary(session),
     )
+
+
+def _unmeasured(about: Mapping[str, Any]) -> int:
+    """How many animals are in view and not measured, by the content of session.json."""
+    found = about.get("verdict") or {}
+    return max(0, int(found.get("n_animals", 1)) - int(found.get("n_measured", 1)))
 
 
 def clip_links(session: Session) -> dict[str, str]:

@@ -159,14 +159,15 @@ def run(
 
     The last line is the verdict; exits with code 4 if the session needs review.
     Several arenas in one image (`[[arenas]]` of the plan, or --set arenas=auto) become one session
-    each.
+    each, and so do several animals in one arena (--set animal.count=2, or auto).
     """
     asked = [] if topic is None else [f"recording.topic={topic}"]
     asked += ["replay.depth=none"] * no_depth + ["replay.candidates=true"] * candidates
     asked += [*["estimation.accept_misfit=true"] * accept, *(settings or [])]
     # first: report a wrong plan or setting at once
     chosen = load_plan(plan, asked)
-    measure = api.run_session if chosen.arenas is None else api.run_arenas
+    alone = chosen.arenas is None and chosen.animal.count == 1
+    measure = api.run_session if alone else api.run_arenas
     with progress_bar() as progress:
         measured = measure(
             recording,
@@ -181,7 +182,7 @@ def run(
         raise typer.Exit(_print_session(measured))
     codes = [0]
     for one in measured:
-        echo(f"arena {one.name}")
+        echo(one.name if chosen.arenas is None else f"arena {one.name}")
         if one.error is not None:
             typer.secho(f"liex: {printable(one.error)}", fg=typer.colors.RED, err=True)
             codes.append(one.error.exit_code)

@@ -149,6 +149,13 @@ class AnimalSettings(SettingsTable):
     )
     spine_min_mm: Positive = Field(40.0, description="shortest length when the length is measured")
     spine_max_mm: Positive = Field(115.0, description="longest length when the length is measured")
+    count: Literal["auto"] | Annotated[int, Field(ge=1, le=4)] = Field(
+        1,
+        description=(
+            "animals of this kind in the arena that are measured, each a session of its own; "
+            "'auto' counts them"
+        ),
+    )
     shared: SharedBody | None = Field(
         None,
         description=(

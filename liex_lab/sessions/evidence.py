@@ -150,6 +150,7 @@ def write_evidence(folder: Path, observations: Observations, subject: Subject) -
         "stretch_sd": subject.stretch_sd,
         "unseen": None if subject.unseen is None else list(subject.unseen),
         "n_animals": subject.n_animals,
+        "n_measured": subject.n_measured,
     }
     columns = {name: getattr(observations, name) for name in COLUMNS}
     text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
@@ -224,6 +225,7 @@ def read_evidence(session: Session) -> tuple[Observations, Subject]:
             None if stretch is None else float(stretch),
             None if unseen is None else (float(unseen[0]), float(unseen[1])),
             int(facts.get("n_animals", 1)),
+            int(facts.get("n_measured", 1)),
         )
     return Observations(skeleton, *columns), subject
 

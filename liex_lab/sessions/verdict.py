@@ -39,6 +39,7 @@ class Verdict:
         accepted: whether the plan accepts misfits (`estimation.accept_misfit`).
         n_hidden: frames in which the animal is behind or under something.
         n_animals_share: share of the frames with an animal in view that show this number.
+        n_measured: how many of them are measured, each in a session of its own.
     """
 
     n_frames: int
@@ -52,6 +53,7 @@ class Verdict:
     accepted: bool = False
     n_hidden: int = 0
     n_animals_share: float = 1.0
+    n_measured: int = 1
 
     @staticmethod
     def of(
@@ -88,9 +90,10 @@ class Verdict:
         reasons = [*misfits, *doubts]
         crowded = int((track.n_animals > n_measured).sum())
         if tracked.n_animals > n_measured:
+            measured = "1 is" if n_measured == 1 else f"{n_measured} are"
             reasons.append(
-                f"{tracked.n_animals} animals are in view at once, more than one in {crowded:,} "
-                f"frames, and {n_measured} of them is followed, whose poses there are not trusted"
+                f"{tracked.n_animals} animals are in view at once, and {measured} measured: in "
+                f"{crowded:,} frames it is unknown which, and no pose is trusted (set animal.count)"
             )
         # of all frames with depth
         elif n_trusted < 0.2 * n_depth:
@@ -102,6 +105,10 @@ class Verdict:
                 "are measured and trusted"
             )
         notes = list(cautions)
+        if 0 < tracked.n_animals < n_measured:
+            notes.append(
+                f"animal.count is {n_measured}, but {tracked.n_animals} stand apart at once"
+            )
         if n_hidden:
             notes.append(f"the animal is hidden in {n_hidden:,} frames")
         if n_doubtful > max(0.05 * track.n_frames, crowded):
@@ -118,6 +125,7 @@ class Verdict:
             accepted,
             n_hidden,
             round(tracked.n_animals_share, 3),
+            n_measured,
         )
 
     @property

@@ -297,7 +297,7 @@ class SessionWriter:
         self._flips = tracked.flips
         memory.release_memory()  # much memory after a long recording
         self._candidates = observations if self.origin.replay_candidates else None
-        self._together = observations if subject.n_animals > 1 else None
+        self._together = observations if subject.n_rivals > 1 else None
         write_evidence(self._folder, observations, subject)
 
     @property

@@ -58,7 +58,7 @@ class HypothesisAssociation:
         t = tuning
         jump = t.ceiling * (1.0 if self._alone else 20.0)  # several animals differ only in position
         costs = t.error_factor, t.shift, t.bend, t.tail, t.ceiling, jump, length_mm
-        self._costs = kernels.TransitionCosts(*map(float, costs))
+        self.costs = kernels.TransitionCosts(*map(float, costs))
 
     def joints(self, observed: Observations, allocate: Allocator = np.empty) -> NDArray[np.float32]:
         """Positions of the k joints that transition costs are measured by.
@@ -111,7 +111,7 @@ class HypothesisAssociation:
         )
         n_beam = 0
         for rows in blocks(n, _BLOCK):
-            n_beam = kernels.extend_all(rows.start, rows.stop, chains, n_beam, frames, self._costs)
+            n_beam = kernels.extend_all(rows.start, rows.stop, chains, n_beam, frames, self.costs)
         path = np.full(n, NONE, np.int64)
         if n_beam:
             kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
@@ -234,7 +234,7 @@ class HypothesisAssociation:
         error = observed.error_mm[used, taken].astype(float)
         at_used = np.empty(len(used))
         kernels.forward_backward(
-            observed.seconds[used], one, two, error, evidence, self._costs, at_used
+            observed.seconds[used], one, two, error, evidence, self.costs, at_used
         )
         return np.interp(np.arange(len(path)), used, at_used)
 

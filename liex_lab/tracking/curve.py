@@ -212,12 +212,12 @@ def _associate(
 ) -> tuple[NDArray[np.int64], Array]:
     """The path (n,) of the animal's hypotheses, and its flip posterior (n,)."""
     chain = HypothesisAssociation(
-        subject.skeleton, subject.length_mm, tuning.chain, subject.n_animals
+        subject.skeleton, subject.length_mm, tuning.chain, subject.n_rivals
     )
     joints = chain.joints(observed, allocate)
     emission = chain.emission(observed, joints, allocate)
     path = chain.path(observed, joints, emission, allocate=allocate)
-    if subject.n_animals > 1 and (other := cost_of_the_other(observed, path)) is not None:
+    if subject.n_rivals > 1 and (other := cost_of_the_other(observed, path)) is not None:
         emission += chain.independent(observed) * other
         path = chain.path(observed, joints, emission, allocate=allocate)
     return path, chain.doubt(observed, path, joints, emission, allocate)
@@ -375,7 +375,7 @@ class OnlineTracker:
         self._lag = lag
         self._motion = tuning.motion
         self._chain = HypothesisAssociation(
-            subject.skeleton, subject.length_mm, tuning.chain, subject.n_animals
+            subject.skeleton, subject.length_mm, tuning.chain, subject.n_rivals
         )
         self._window = Observations.empty(subject.skeleton, np.zeros(0, np.int64))
         # joints of the window's hypotheses that the association uses

@@ -23,9 +23,6 @@ from liex_lab.scene.height_maps import N_OBJECTS
 Array = NDArray[np.float64]
 Small = NDArray[np.float32]
 
-# two components, each with both headings: hypothesis h ^ 1 is h reversed
-N_HYPOTHESES = 4
-
 
 @dataclass(frozen=True)
 class Observations(Rows):
@@ -77,18 +74,21 @@ class Observations(Rows):
     objects: Small
 
     @staticmethod
-    def empty(skeleton: Skeleton, times_ns: NDArray[np.int64]) -> Observations:
+    def empty(
+        skeleton: Skeleton, times_ns: NDArray[np.int64], n_components: int = 2
+    ) -> Observations:
         """Observations of frames without detections; `has_depth` is True throughout.
 
         Args:
             skeleton: kinematic tree of the animal.
             times_ns: (n,) time stamps.
+            n_components: components of a frame, each with two hypotheses.
 
         Returns:
-            n frames of four hypotheses, all NaN.
+            n frames of hypotheses, four by default, all NaN.
         """
         n = len(times_ns)
-        h = N_HYPOTHESES
+        h = 2 * n_components
         d = int(skeleton.axes[1:].sum())
 
         def nothing(*shape: int) -> Small:
@@ -146,7 +146,7 @@ class Observations(Rows):
 
     def forget(self, copies: NDArray[np.bool_]) -> None:
         """Clear, in place, the observations of frames (n,) whose depth image is a copy."""
-        nothing = Observations.empty(self.skeleton, self.times_ns)
+        nothing = Observations.empty(self.skeleton, self.times_ns, self.score.shape[1] // 2)
         for name in {*COLUMNS} - {"times_ns", "repeats"}:
             getattr(self, name)[copies] = getattr(nothing, name)[copies]
         self.has_depth[copies] = False

@@ -62,6 +62,7 @@ class FrameTracker:
         sample_fit: agreement of the model with the sampled frames; None without sampled frames.
         shape: the session's own shape; None if it is not used.
         noisy: whether the sensor has noise, so that a depth image which repeats is a copy.
+        n_measured: how many animals of the recording are measured.
     """
 
     estimator: PoseEstimator
@@ -77,6 +78,7 @@ class FrameTracker:
     sample_fit: SampleFit | None = None
     shape: OwnShape | None = None
     noisy: bool = False
+    n_measured: int = 1
 
     @staticmethod
     def prepare(
@@ -180,6 +182,7 @@ class FrameTracker:
             TrackingParameters.of(skeleton.name).motion.stretch_sd(self.blur, self.size_spread),
             None if self.shape is None else self.shape.unseen,
             1 if self.sample_fit is None else self.sample_fit.n_animals,
+            self.n_measured,
         )
 
     def observe(self, frames: Sequence[DepthFrame]) -> Observations:
@@ -202,8 +205,8 @@ class FrameTracker:
         with threads(len(frames) > 1):
             hypotheses = self.estimator.hypotheses(depths, self.scene, self.size)
             observed.objects[:] = hypotheses[0].crops.objects
-            poses = [self._put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
-            self._put_agreement(observed, hypotheses, poses, self.scene.cleared(depths))
+            poses = [self.put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
+            self.put_agreement(observed, hypotheses, poses, self.scene.cleared(depths))
         if self.noisy:
             observed.forget(observed.repeats)
         return observed
@@ -226,7 +229,7 @@ class FrameTracker:
         """
         return track_whole(self.subject, observed, corrections, allocate=allocate)
 
-    def _put(
+    def put(
         self, observed: Observations, h: int, estimates: Estimates, depths: NDArray[np.float32]
     ) -> Pose:
         """Set estimates as hypothesis h, with their component's pixels and centroid.
@@ -254,7 +257,7 @@ class FrameTracker:
         observed.centroid_px[found, h] = self.scene.camera.project(from_camera)
         return pose
 
-    def _put_agreement(
+    def put_agreement(
         self,
         observed: Observations,
         hypotheses: Sequence[Estimates],

@@ -131,7 +131,7 @@ def test_each_warning_is_a_sentence_of_the_numbers_behind_it(session):
     again.__dict__.update(flips=exchanged.assign(source="model", undone_at=""), bouts=bouts)
     parts = (
         "Dark & <cold>.",
-        "nothing is measured of the others. Record one animal at a time, or check in the replay",
+        "nothing is measured of the others. Measure them all with --set animal.count=auto",
         "The camera did not deliver 6 frames, in 1 gap; no speed or distance is measured across",
         "The animal is behind or under something in 1 frame (0.6% of 174), which have no pose; the",
         "73 frames have no pose (42.0% of 174); times and shares are of the rest.",

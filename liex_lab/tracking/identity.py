@@ -1,0 +1,282 @@
+"""Identity of several animals over a recording: which component of each frame is which animal.
+
+A hidden Markov model over the assignments of N components to N animals (at most 24). The transition
+cost of an assignment is the sum over the animals of the association's transition cost, the
+Mahalanobis distance of the shift and bend of the joints between two frames; the emission cost is
+that of the sizes, if the animals differ in it. Viterbi's path (Viterbi 1967) is the assignment over
+the whole recording, and the forward pass from one end of a crossing to the other gives the
+probability that its animals left it exchanged. Frames in which not all animals are in view follow
+their neighbours.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.runtime.kernels import kernel
+from liex_lab.tracking._association_kernels import transition_cost
+from liex_lab.tracking.association import NONE, HypothesisAssociation
+from liex_lab.tracking.observations import COLUMNS, Array, Observations
+from liex_lab.tracking.smoother import TrackingParameters
+from liex_lab.tracking.track import Subject, Track, spans
+
+Slots = NDArray[np.int64]
+
+UNCLEAR = 0.1  # probability of an exchange above which poses are not trusted
+CERTAIN = 0.9  # least certainty for statistics per animal
+_SIZE_SD = 0.15  # of the logarithm of an animal's pixels, from posture to posture
+_INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
+_UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
+_JOIN_S = 0.5  # crossings nearer to each other are one
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Frames in which animals may have been exchanged.
+
+    Attributes:
+        start: first frame.
+        stop: frame after the last.
+        animals: which of them, from 0.
+        p_swap: probability that they leave it in other roles than the tracks say.
+        decided_by: what decided it: motion or size.
+    """
+
+    start: int
+    stop: int
+    animals: tuple[int, ...]
+    p_swap: float
+    decided_by: str
+
+
+@dataclass(frozen=True)
+class Identity:
+    """The components of N animals in n frames.
+
+    Attributes:
+        slots: (n, N) component of each animal, `NONE` if it is not in view.
+        crossings: in order of time.
+    """
+
+    slots: Slots
+    crossings: tuple[Crossing, ...]
+
+
+def identify(
+    observed: Sequence[Observations], subjects: Sequence[Subject], areas_mm2: Sequence[float]
+) -> Identity:
+    """Assign the components of every frame to the animals.
+
+    Args:
+        observed: for each animal, all frames measured with its body.
+        subjects: the animals.
+        areas_mm2: their usual areas.
+    """
+    n_animals = len(observed)
+    known = observed[0].known[:, ::2]
+    full = np.flatnonzero(known.all(axis=1))
+    slots = np.full((len(known), n_animals), NONE, np.int64)
+    states = np.array(list(permutations(range(n_animals))))
+    crossings: tuple[Crossing, ...] = ()
+    moves = np.zeros((0, n_animals, n_animals, n_animals))
+    if len(full):
+        moves = np.stack(
+            [_moves(one[full], subject) for one, subject in zip(observed, subjects, strict=True)], 1
+        )
+        animals = np.arange(n_animals)
+        # cost (m - 1, S, S) of going from one assignment to another
+        transition = moves[:, animals, states[:, None, :], states[None, :, :]].sum(axis=-1)
+        emission = _sizes(observed[0][full], np.array(areas_mm2), states)
+        path = _viterbi(transition, emission)
+        slots[full] = states[path]
+        crossings = _crossings(observed[0], full, transition, emission, path, states)
+    _follow(observed, subjects, slots, known)
+    return Identity(slots, crossings)
+
+
+def own_observations(observed: Observations, slots: Slots) -> Observations:
+    """The observations of one animal: its component's two hypotheses first, and no others.
+
+    Args:
+        observed: hypotheses (n, 2 N) of all components with its body.
+        slots: (n,) its component, `NONE` if it is not in view.
+    """
+    own = Observations.empty(observed.skeleton, observed.times_ns)
+    rows = np.flatnonzero(slots != NONE)
+    for name in COLUMNS:
+        values, out = getattr(observed, name), getattr(own, name)
+        if name in ("has_depth", "repeats", "objects"):
+            out[:] = values
+        elif name != "times_ns":
+            for h in range(2):
+                out[rows, h] = values[rows, 2 * slots[rows] + h]
+    return own
+
+
+def flag_unclear(track: Track, crossings: Sequence[Crossing]) -> None:
+    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are.
+
+    Args:
+        track: of one of the animals.
+        crossings: in which it takes part.
+    """
+    for one in crossings:
+        if one.p_swap > UNCLEAR:
+            flag = track.flag[one.start : one.stop]
+            flag[flag == ""] = "doubtful"
+
+
+def doubt(crossings: Sequence[Crossing]) -> str:
+    """A sentence if an animal may have become another one over a recording; "" if that is clear.
+
+    Args:
+        crossings: in which the animal takes part.
+    """
+    certain = float(np.prod([1.0 - one.p_swap for one in crossings]))
+    if certain >= CERTAIN:
+        return ""
+    n = sum(one.p_swap > UNCLEAR for one in crossings)
+    return (
+        f"the animals may have been exchanged at {n} of {len(crossings)} crossings: that this is "
+        f"the same animal throughout is {certain:.0%} certain, too little for statistics per animal"
+    )
+
+
+def _moves(observed: Observations, subject: Subject) -> Array:
+    """Cost (m - 1, N, N) of one animal's way from each component to each of the next frame."""
+    tuning = TrackingParameters.of(subject.skeleton.name).chain
+    chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning, 2)
+    out = np.empty((max(len(observed) - 1, 0), *(observed.score.shape[1] // 2,) * 2))
+    _transitions(observed.seconds, chain.joints(observed), observed.error_mm, chain.costs, out)
+    return out
+
+
+@kernel()
+def _transitions(seconds, joints, error, costs, out):
+    """Fill out (m - 1, N, N) with the least transition cost between the poses of components."""
+    for t in range(out.shape[0]):
+        dt = seconds[t + 1] - seconds[t]
+        for i in range(out.shape[1]):
+            for j in range(out.shape[2]):
+                out[t, i, j] = np.inf
+                for g in range(2 * i, 2 * i + 2):
+                    for h in range(2 * j, 2 * j + 2):
+                        if np.isfinite(error[t, g]) and np.isfinite(error[t + 1, h]):
+                            cost = transition_cost(
+                                joints[t, g],
+                                joints[t + 1, h],
+                                error[t, g],
+                                error[t + 1, h],
+                                dt,
+                                costs,
+                            )
+                            out[t, i, j] = min(out[t, i, j], cost)
+
+
+def _sizes(observed: Observations, areas_mm2: Array, states: Slots) -> Array:
+    """Cost (m, S) of each assignment by the sizes of the outlines, nats."""
+    apart = np.isfinite(observed.objects[..., 0]).sum(axis=1) >= len(areas_mm2)
+    size = np.log(np.maximum(observed.n_px[:, ::2], 1))
+    size -= size.mean(axis=1, keepdims=True)
+    usual = np.log(areas_mm2) - np.log(areas_mm2).mean()
+    off = ((size[:, states] - usual) / _SIZE_SD) ** 2
+    step_s = np.diff(observed.seconds, prepend=observed.seconds[0] - _INDEPENDENT_S)
+    weight = apart * np.minimum(step_s / _INDEPENDENT_S, 1.0)
+    return np.asarray(0.5 * weight[:, None] * np.minimum(off.sum(axis=-1), 18.0))
+
+
+def _viterbi(transition: Array, emission: Array) -> Slots:
+    """The path (m,) of least cost through the assignments."""
+    parent = np.zeros(emission.shape, np.int64)
+    cost = emission[0]
+    for t, step in enumerate(transition, 1):
+        through = cost[:, None] + step
+        parent[t] = through.argmin(axis=0)
+        cost = through.min(axis=0) + emission[t]
+    path = np.empty(len(emission), np.int64)
+    path[-1] = cost.argmin()
+    for t in range(len(path) - 1, 0, -1):
+        path[t - 1] = parent[t, path[t]]
+    return path
+
+
+def _crossings(
+    observed: Observations,
+    full: Slots,
+    transition: Array,
+    emission: Array,
+    path: Slots,
+    states: Slots,
+) -> tuple[Crossing, ...]:
+    """The stretches in which another assignment is possible, with its probability."""
+    seconds = observed.seconds
+    steps = np.arange(len(full) - 1)
+    others = transition[steps, path[:-1]] - transition[steps, path[:-1], path[1:]][:, None]
+    others[steps, path[1:]] = np.inf
+    unclear = others.min(axis=1) < _UNCLEAR
+    unclear |= np.isfinite(observed.objects[full[1:], :, 0]).sum(axis=1) < states.shape[1]
+    if not unclear.any():
+        return ()
+    at = np.flatnonzero(unclear)
+    apart = np.flatnonzero(seconds[full[at[1:]]] - seconds[full[at[:-1] + 1]] > _JOIN_S)
+    begins = at[np.append(0, apart + 1)]
+    ends = at[np.append(apart, len(at) - 1)] + 1
+    later = _backward(transition, emission)
+    found = []
+    for begin, end in zip(begins, ends, strict=True):
+        cost = np.full((2, len(states)), np.inf)  # with the sizes, and by motion alone
+        cost[:, path[begin]] = 0.0
+        for t in range(begin, end):
+            cost = -np.logaddexp.reduce(-(cost[..., None] + transition[t]), axis=1)
+            cost[0] += emission[t + 1]
+        cost[0] += later[end]
+        p = np.exp(cost.min(axis=1, keepdims=True) - cost)
+        p_swap, by_motion = 1.0 - p[:, path[end]] / p.sum(axis=1)
+        decided_by = "size" if by_motion > max(2.0 * p_swap, 0.02) else "motion"
+        other = np.argsort(cost[0])[:2]
+        changed = states[other[0]] != states[other[1]]
+        animals = tuple(int(k) for k in np.flatnonzero(changed))
+        found.append(
+            Crossing(int(full[begin]), int(full[end]) + 1, animals, float(p_swap), decided_by)
+        )
+    return tuple(found)
+
+
+def _backward(transition: Array, emission: Array) -> Array:
+    """Cost (m, S) of all that follows each assignment."""
+    later = np.zeros(emission.shape)
+    for t in range(len(transition) - 1, -1, -1):
+        after = later[t + 1] + emission[t + 1]
+        later[t] = -np.logaddexp.reduce(-(transition[t] + after), axis=1)
+        later[t] -= later[t].min()
+    return later
+
+
+def _follow(
+    observed: Sequence[Observations],
+    subjects: Sequence[Subject],
+    slots: Slots,
+    known: NDArray[np.bool_],
+) -> None:
+    """Assign the components of frames that do not show all animals, in place, each to the animal
+    that was or will be nearest to it.
+    """
+    seconds = observed[0].seconds
+    places = np.array([one.centroid_mm[:, ::2].astype(float) for one in observed[:1]])[0]
+    full = np.flatnonzero((slots != NONE).all(axis=1))
+    if not len(full):
+        return
+    for start, stop in spans(np.asarray(~known.all(axis=1))):
+        before, after = full[full < start][-1:], full[full >= stop][:1]
+        for t in range(start, stop):
+            near = min((*before, *after), key=lambda row: abs(seconds[row] - seconds[t]))
+            there = np.flatnonzero(known[t])
+            off = np.linalg.norm(places[near, slots[near]][:, None] - places[t, there], axis=-1)
+            for _ in there:
+                animal, one = np.unravel_index(np.argmin(off), off.shape)
+                slots[t, animal] = there[one]
+                off[animal] = np.inf
+                off[:, one] = np.inf

@@ -1,0 +1,431 @@
+"""Several animals of a kind in every frame: outlines that touch are explained by all bodies.
+
+Animals that stand free are one component each, measured as a single animal is. A component of
+several animals is cut into parts by lines in several directions, each part is measured as an
+animal, and all bodies are rendered into one image, in which the nearest surface wins. The cost of
+such an explanation is
+
+    sum over observed pixels of min(|z_rendered - z_observed|, c) + c times the rendered pixels
+    beside the component, over the observed pixels; c where nothing is rendered.
+
+The best explanations are then improved alternately: every pixel goes to the body whose surface is
+nearest to it in depth, or in the image where none is rendered, and each body is measured again on
+its own pixels (hard expectation maximisation). A component that one body explains as well is one
+animal. Only components of several animals pay for all this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from liex_lab.errors import EstimationError
+from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
+from liex_lab.runtime.kernels import kernel
+from liex_lab.runtime.processes import in_parallel, threads
+from liex_lab.scene._blob_kernels import N_PX, SLOPE, back_slope, blob_moments
+from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.height_maps import ANIMAL_HEIGHTS, N_OBJECTS, HeightMaps
+from liex_lab.tracking.observations import Array, Observations
+from liex_lab.tracking.residual import behind_something, render_crops
+from liex_lab.tracking.tracker import FrameTracker
+
+Mask = NDArray[np.bool_]
+Labels = NDArray[np.int64]  # of pixels: the animal's number, -1 for none
+
+_SAME_SIZE = 0.25  # largest difference of the logarithms of areas of animals of one size
+_TORN = 1.25  # pixels connected in blocks over those of one animal
+_FEWEST = 5  # frames in which all stand apart
+_LEAST_SHARE = 0.3  # area of an animal over that of the largest one in view
+_LEAST_AREA = 0.5  # of an animal's visible part, over the usual area of the smallest one
+_N_DIRECTIONS = 4  # of the cuts, in half a turn
+_KEPT = 2  # explanations that are improved
+_SWEEPS = 2
+_MOST_OFF = 0.2  # of a pixel, in roots of the animal's area
+_OVER_MM = 8.0  # an animal over the edge of another one is nearer by this much
+_BETTER = 0.85  # cost of several bodies over that of one
+
+
+@dataclass(frozen=True)
+class JointTracker:
+    """Measures several animals in each frame; single-frame observations of a frame name no animal.
+
+    Attributes:
+        scene: the segmenter of the recording's camera.
+        trackers: one for each animal, the largest first; animals of one size share one.
+        height_mm: usual mean height of an animal from the floor.
+    """
+
+    scene: BackgroundSubtraction
+    trackers: tuple[FrameTracker, ...]
+    height_mm: float
+
+    @staticmethod
+    def prepare(alone: FrameTracker, sample: NDArray[np.float32], n_animals: int) -> JointTracker:
+        """The tracker of several animals, from a sample of frames in which they stand apart.
+
+        Args:
+            alone: the tracker of one of them.
+            sample: (n, H, W) float32 mm, frames spread over the recording, at the scene's stride.
+            n_animals: how many animals to measure, 2 or more.
+
+        Raises:
+            EstimationError: fewer animals stand apart in all frames, or there is no still
+                background.
+        """
+        scene = alone.scene
+        if not isinstance(scene, BackgroundSubtraction):
+            raise EstimationError(
+                "several animals are measured before a still background, and this animal is "
+                "separated by its distance; leave animal.count at 1"
+            )
+        area, images = _one_by_one(scene, sample, n_animals)
+        if not len(images[0]):
+            raise EstimationError(
+                f"animal.count is {n_animals}, but hardly a frame of a sample shows as many "
+                "animals apart; correct the number, or set animal.count to 'auto'"
+            )
+        groups = np.cumsum(np.diff(-np.log(area), prepend=-np.log(area[0])) > _SAME_SIZE)
+        trackers: list[FrameTracker] = []
+        for group in np.unique(groups):
+            ranks = np.flatnonzero(groups == group)
+            own = np.concatenate([images[rank][k :: len(ranks)] for k, rank in enumerate(ranks)])
+            usual = replace(scene, area_mm2=float(np.median(area[ranks])))
+            usual = replace(usual, volume_mm3=usual.usual_volume(own))
+            tracker = FrameTracker.prepare(
+                alone.estimator,
+                usual,
+                own,
+                alone.spine_mm if alone.size_origin == "plan" else None,
+                bridge_s=alone.bridge_s,
+                adapt=alone.shape is not None,
+            )
+            trackers += [replace(tracker, n_measured=n_animals)] * len(ranks)
+        # the smallest animal and all of them together are equally far from this area
+        middle = float(np.sqrt(area[-1] * area.sum()))
+        height_mm = scene.volume_mm3 / scene.area_mm2
+        return JointTracker(replace(scene, area_mm2=middle), tuple(trackers), height_mm)
+
+    @property
+    def estimator(self) -> PoseEstimator:
+        """The pose estimator of all animals."""
+        return self.trackers[0].estimator
+
+    @cached_property
+    def _bodies(self) -> list[FrameTracker]:
+        """The trackers, each once."""
+        return list({id(tracker): tracker for tracker in self.trackers}.values())
+
+    @cached_property
+    def _least_mm2(self) -> float:
+        smallest = self.trackers[-1].scene
+        return _LEAST_AREA * smallest.area_mm2
+
+    def observe(self, frames: Sequence[DepthFrame]) -> list[Observations]:
+        """The pose hypotheses of consecutive frames, with the body of each animal.
+
+        Args:
+            frames: at least one.
+
+        Returns:
+            For each animal, observations of n frames, arena frame: two hypotheses of each of N
+            components, of which any may be that animal. Animals of one size share them.
+        """
+        depths = stacked(frames)
+        times = np.array([frame.time_ns for frame in frames], np.int64)
+        with threads(len(frames) > 1):
+            crops = self.scene.extract(
+                depths, self._size, camera_view=self._camera_view, n_candidates=N_OBJECTS
+            )
+            parts = self._parts(crops, depths)
+            cleared = self.scene.cleared(depths)
+            found = {}
+            for body in self._bodies:
+                observed = Observations.empty(self.estimator.skeleton, times, len(self.trackers))
+                observed.has_depth[:] = [has_readings(depth) for depth in depths]
+                observed.repeats[:] = [frame.repeats for frame in frames]
+                observed.objects[:] = crops.objects[: len(frames)]
+                self._measure(body, observed, parts, depths, cleared)
+                if body.noisy:
+                    observed.forget(observed.repeats)
+                found[id(body)] = observed
+        return [found[id(tracker)] for tracker in self.trackers]
+
+    @property
+    def _camera_view(self) -> bool:
+        return self.estimator.model.method.camera_view
+
+    @property
+    def _size(self) -> float:
+        return self.trackers[0].size if self.estimator.model.method.session_size else 1.0
+
+    def _measure(
+        self,
+        body: FrameTracker,
+        observed: Observations,
+        parts: HeightMaps,
+        depths: NDArray[np.float32],
+        cleared: NDArray[np.float32],
+    ) -> None:
+        """Set the hypotheses of all parts (N n rows, part by part) with the body of one animal."""
+        n = len(observed)
+        cameras = self.scene.crop_cameras(parts, self._camera_view)
+        whole = self.estimator.candidates(parts, cameras, body.size)
+        detections = [whole[k * n : (k + 1) * n] for k in range(len(self.trackers))]
+        hypotheses = self.estimator.both_directions(detections, body.size)
+        poses = [body.put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
+        body.put_agreement(observed, hypotheses, poses, cleared)
+        touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < len(detections)
+        for h in range(0, len(hypotheses), 2):  # one animal may lie over the edge of another
+            rows = np.flatnonzero(touching & hypotheses[h].found)
+            behind = behind_something(hypotheses[h].crops[rows], cleared[rows], _OVER_MM)
+            observed.behind[rows, h] = observed.behind[rows, h + 1] = behind
+
+    def _parts(self, crops: HeightMaps, depths: NDArray[np.float32]) -> HeightMaps:
+        """The height map of each animal, as far as it is in view: N n rows, part by part.
+
+        crops are the components of n frames, N_OBJECTS n rows.
+        """
+        wanted, n = len(self.trackers), len(depths)
+        right = self._are_animals(crops).reshape(N_OBJECTS, n)
+        area = crops.blobs.area_mm2.reshape(N_OBJECTS, n)
+        order = np.argsort(np.where(right, -area, 0.0), axis=0, kind="stable")[:wanted]
+        rows = order * n + np.arange(n)
+        there = np.take_along_axis(right, order, axis=0)
+        parts = crops[rows.ravel()]
+        parts.n_px[~there.ravel()] = 0
+        missing = np.where(there[0], wanted - there.sum(axis=0), 0)
+        shown_px = parts.blobs.n_px[:n] * parts.step[:n] ** 2
+        # blocks connect animals that pixels separate: the largest component shows one of them
+        torn = np.flatnonzero((missing > 0) & (parts.n_px[:n] > _TORN * shown_px))
+        if len(torn):
+            others = self._beside(parts[torn], depths[torn])
+            found = self._are_animals(others)
+            parts.put(torn[found] + n * (wanted - 1), others[found])
+            missing[torn[found]] -= 1
+        for k in np.unique(missing[missing > 0]):  # all in the largest component
+            some = np.flatnonzero(missing == k)
+            split, accepted = self._explain(crops[rows[0, some]], int(k) + 1)
+            for j in range(k + 1):
+                at = some[accepted] + n * (0 if j == 0 else wanted - 1 - k + j)
+                parts.put(at, split[j * len(some) : (j + 1) * len(some)][accepted])
+        return parts
+
+    def _are_animals(self, crops: HeightMaps) -> Mask:
+        """Which components (n,) are as large and high as one of the animals or several of them."""
+        area = np.where(crops.found, crops.blobs.area_mm2, 0.0)
+        right = area >= self._least_mm2
+        if not self._camera_view:  # else there is no floor below them
+            height = crops.blobs.volume_mm3 / np.maximum(area, 1e-9) / self.height_mm
+            right &= (height > ANIMAL_HEIGHTS[0]) & (height < ANIMAL_HEIGHTS[1])
+        return np.asarray(right)
+
+    def _beside(self, crops: HeightMaps, depths: NDArray[np.float32]) -> HeightMaps:
+        """What else (q rows) is in frames (q, H, W) mm without the components that were found."""
+        scene = self.scene
+        left = depths[:, :: scene.stride, :: scene.stride].copy()
+        for image, mask, step in zip(left, scene.animal_masks(crops), crops.step, strict=True):
+            own = cv2.dilate(mask.astype(np.uint8), np.ones((2 * step // scene.stride + 1,) * 2))
+            image[own > 0] = scene.background[own > 0]
+        return scene.extract(left, self._size, camera_view=self._camera_view)
+
+    def _explain(self, blobs: HeightMaps, m: int) -> tuple[HeightMaps, Mask]:
+        """Cut components (q rows) into the parts of m animals each: m q rows, part by part; and
+        whether (q,) they are so many animals.
+        """
+        q = len(blobs.n_px)
+        labels, bodies = self._cuts(blobs, m)
+        cost, drawn = self._tried(blobs, labels, bodies)
+        rows = np.arange(q)[:, None]
+        order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
+        best = rows[:, 0], order[:, 0]
+        kept_cost, kept = cost[best], labels[best]
+        for k in range(order.shape[1]):
+            at = rows[:, 0], order[:, k]
+            now, own, shown = labels[at][:, None], bodies[at][:, None], drawn[at]
+            for _ in range(_SWEEPS):
+                now = self._owners(blobs, shown, now[:, 0])[:, None]
+                again, fresh = self._tried(blobs, now, own)
+                better = again[:, 0] < kept_cost
+                kept_cost = np.where(better, again[:, 0], kept_cost)
+                kept = np.where(better[:, None, None], now[:, 0], kept)
+                shown = fresh[:, 0]
+        alone, _ = self._tried(
+            blobs,
+            np.where(blobs.heights > 0, 0, -1)[:, None].repeat(len(self._bodies), axis=1),
+            np.tile(np.arange(len(self._bodies))[:, None], (q, 1, 1)),
+        )
+        split = self._cut(blobs, kept, m)
+        enough = (split.blobs.area_mm2.reshape(m, q) > 0.6 * self._least_mm2).all(axis=0)
+        return split, enough & (kept_cost < _BETTER * alone.min(axis=1))
+
+    def _cuts(self, blobs: HeightMaps, m: int) -> tuple[Labels, NDArray[np.int64]]:
+        """Labels (q, P, S, S) of the parts in P ways of cutting, and the body (q, P, m) of each."""
+        areas = np.array([tracker.scene.area_mm2 for tracker in self.trackers])
+        bodies = np.array([self._bodies.index(tracker) for tracker in self.trackers])
+        # of animals of two sizes either may be on either side
+        chosen = np.arange(len(areas)) if len(areas) == m else np.arange(m)
+        n_ways = _N_DIRECTIONS * (1 if len(self._bodies) == 1 else 2)
+        angles = np.arange(n_ways) * np.pi / _N_DIRECTIONS
+        share = np.cumsum(areas[chosen]) / areas[chosen].sum()
+        v, u = np.mgrid[: blobs.heights.shape[1], : blobs.heights.shape[2]]
+        labels = np.full((len(blobs.n_px), n_ways, *u.shape), -1, np.int64)
+        for i, heights in enumerate(blobs.heights):
+            inside = heights > 0
+            axes = np.linalg.eigh(np.cov(u[inside], v[inside]))[1]  # across and along
+            for p, angle in enumerate(angles):
+                along = axes @ (np.cos(angle), np.sin(angle)) @ (u[inside], v[inside])
+                labels[i, p, inside] = np.searchsorted(np.quantile(along, share[:-1]), along)
+        return labels, np.tile(bodies[chosen], (len(labels), n_ways, 1))
+
+    def _cut(self, blobs: HeightMaps, labels: Labels, m: int) -> HeightMaps:
+        """The height maps of the parts of components (q rows): m q rows, part by part."""
+        parts = HeightMaps.join([blobs] * m)
+        mine = np.concatenate([labels == j for j in range(m)])
+        parts.heights[:] = np.where(mine, parts.heights, 0)
+        behind_mm = self.scene.view.behind_mm if self._camera_view else 0.0
+        if self._camera_view:  # heights are measured from behind the middle of each part
+            n_px = np.maximum(mine.sum(axis=(1, 2)), 1)
+            lift = behind_mm - parts.heights.sum(axis=(1, 2)) / 16.0 / n_px
+            raised = parts.heights + (16.0 * lift)[:, None, None]
+            parts.heights[:] = np.where(mine, np.maximum(raised, 1), 0)
+            parts.distance[:] += lift
+        camera = self.scene.camera
+        in_parallel(
+            _measure_parts,
+            len(parts.n_px),
+            self.scene.planes(parts, self._camera_view),
+            np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+            self.scene.view_rotation(self._camera_view),
+            behind_mm,
+            parts.rows,
+        )
+        return parts
+
+    def _tried(
+        self, blobs: HeightMaps, labels: Labels, bodies: NDArray[np.int64]
+    ) -> tuple[Array, NDArray[np.float32]]:
+        """Cost (q, P) of explaining components (q rows) by the parts `labels` (q, P, S, S), each
+        with its body (q, P, m); and the rendered bodies (q, P, m, S, S) mm.
+        """
+        q, p, size = labels.shape[:3]
+        m = bodies.shape[2]
+        repeated = blobs[np.repeat(np.arange(q), p)]
+        parts = self._cut(repeated, labels.reshape(q * p, size, size), m)
+        which = bodies.reshape(q * p, m).T.ravel()
+        drawn = np.zeros((m * q * p, size, size), np.float32)
+        for k, body in enumerate(self._bodies):
+            rows = np.flatnonzero((which == k) & parts.found)
+            drawn[rows] = self._rendered(body, parts[rows])
+        together = drawn.reshape(m, q, p, size, size).transpose(1, 2, 0, 3, 4)
+        cost = self._cost(blobs, together)
+        missing = ~parts.found.reshape(m, q, p).all(axis=0)
+        return np.where(missing, np.inf, cost), together
+
+    def _rendered(self, body: FrameTracker, parts: HeightMaps) -> NDArray[np.float32]:
+        """The best pose of a body in each part (k rows), rendered: (k, S, S) mm."""
+        drawn = np.zeros(parts.heights.shape, np.float32)
+        if not len(drawn):
+            return drawn
+        cameras = self.scene.crop_cameras(parts, self._camera_view)
+        best = self.estimator.best_of(parts, cameras, body.size)
+        some = np.flatnonzero(best.found)
+        if len(some):
+            pose = best.chosen.pose[some]
+            if body.shape is not None:
+                pose = body.shape.corrected(self.estimator, pose, body.size)
+            pose = pose.moved(self.scene.floor.T_arena_camera)
+            across = body.body.across(pose.scale)
+            drawn[some] = render_crops(body.body.surface, pose, across, parts[some], self.scene)
+        return drawn
+
+    def _observed(self, blobs: HeightMaps) -> NDArray[np.float32]:
+        """Depth (q, S, S) mm of components, 0 outside."""
+        size = blobs.heights.shape[1]
+        a, b, c = self.scene.planes(blobs, self._camera_view).T[:, :, None, None]
+        pixel = np.arange(size) * blobs.step[:, None]
+        u = (blobs.origin[:, :1] + pixel)[:, None, :]
+        v = (blobs.origin[:, 1:] + pixel)[:, :, None]
+        up = 1.0 - blobs.heights / 16.0 / blobs.distance[:, None, None]
+        return np.where(blobs.heights > 0, up / (a * u + b * v + c), 0.0).astype(np.float32)
+
+    def _cost(self, blobs: HeightMaps, drawn: NDArray[np.float32]) -> Array:
+        """Cost (q, P) mm of rendered bodies (q, P, m, S, S), see the module."""
+        most = np.float32(_MOST_OFF * np.sqrt(self.trackers[-1].scene.area_mm2))
+        observed = self._observed(blobs)[:, None]
+        nearest = np.where(drawn > 0, drawn, np.inf).min(axis=2)
+        inside = observed > 0
+        off = np.where(inside, np.minimum(np.abs(nearest - observed), most), 0.0)
+        beside = most * (np.isfinite(nearest) & ~inside)
+        n_px = np.maximum(inside.sum(axis=(2, 3)), 1)
+        return np.asarray((off + beside).sum(axis=(2, 3)) / n_px)
+
+    def _owners(self, blobs: HeightMaps, drawn: NDArray[np.float32], labels: Labels) -> Labels:
+        """Labels (q, S, S) of the pixels by the rendered bodies (q, m, S, S) nearest to them."""
+        observed = self._observed(blobs)
+        out = labels.copy()
+        for i, bodies in enumerate(drawn):
+            if not all(body.any() for body in bodies):
+                continue
+            away = np.stack(
+                [
+                    cv2.distanceTransform((body == 0).astype(np.uint8), cv2.DIST_L2, 3)
+                    for body in bodies
+                ]
+            )
+            off = np.where(bodies > 0, np.abs(bodies - observed[i]), 1e3 * (1.0 + away))
+            out[i] = np.where(observed[i] > 0, off.argmin(axis=0), -1)
+        return out
+
+
+def _one_by_one(
+    scene: BackgroundSubtraction, sample: NDArray[np.float32], n_animals: int
+) -> tuple[Array, list[NDArray[np.float32]]]:
+    """Usual areas (N,) mm^2 of the animals of a sample, the largest first, and for each of these
+    ranks the images (k, H, W) mm in which they stand apart, without the others.
+    """
+    crops = scene.extract(sample, 1.0, n_candidates=n_animals)
+    n = len(sample)
+    rows = np.arange(n_animals)[:, None] * n + np.arange(n)
+    blobs = crops.blobs
+    height = blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)
+    animals = crops.found & (height > ANIMAL_HEIGHTS[0] * scene.volume_mm3 / scene.area_mm2)
+    animals &= crops.n_px < _TORN * blobs.n_px * (crops.step // scene.stride) ** 2
+    animals &= blobs.area_mm2 > _LEAST_SHARE * np.tile(blobs.area_mm2[rows].max(axis=0), n_animals)
+    apart = np.flatnonzero(animals[rows].all(axis=0))
+    if len(apart) < _FEWEST:
+        return np.ones(n_animals), [sample[:0]] * n_animals
+    area = blobs.area_mm2[rows[:, apart]]
+    order = np.argsort(-area, axis=0, kind="stable")
+    square = np.ones((7, 7), np.uint8)
+    masks = np.array(
+        [scene.animal_masks(crops[rows[k, apart]]) for k in range(n_animals)], np.uint8
+    )
+    images = []
+    for rank in range(n_animals):
+        left = sample[apart].copy()
+        for i, k in enumerate(order[rank]):
+            others = cv2.dilate(np.delete(masks[:, i], k, axis=0).max(axis=0), square) > 0
+            others &= masks[k, i] == 0
+            left[i] = np.where(others, scene.background, left[i])
+        images.append(left)
+    return np.median(-np.sort(-area, axis=0), axis=1), images
+
+
+@kernel(nogil=True)
+def _measure_parts(planes, intrinsics, rotation, behind_mm, crops, start, stop):
+    """Fill the moments and numbers of pixels of height maps (n rows of `CropRows`)."""
+    for k in range(start, stop):
+        heights, origin, step = crops.heights[k], crops.origin[k], crops.step[k]
+        moments = crops.moments[k]
+        distance = crops.distance[k]
+        blob_moments(heights, origin, step, planes[k], intrinsics, rotation, distance, moments)
+        if behind_mm > 0.0 and moments[N_PX] > 0:
+            moments[SLOPE] = back_slope(heights, origin, step, intrinsics, distance, moments)
+        crops.n_px[k] = int(moments[N_PX] * step * step)

@@ -1,0 +1,103 @@
+"""Each of several animals keeps its name; where that is unclear, its exchange has a probability."""
+
+import numpy as np
+import pytest
+
+from liex_lab.tracking.curve import track_whole
+from liex_lab.tracking.identity import (
+    CERTAIN,
+    Crossing,
+    doubt,
+    flag_unclear,
+    identify,
+    own_observations,
+)
+from liex_lab.tracking.observations import Observations
+from tests.tracking.stories import SUBJECT, joint_error, lose, told, walk
+
+SECONDS = np.arange(90) / 30.0
+WALKS = [walk(SECONDS), walk(SECONDS + 2.6), walk(SECONDS + 1.3)]
+LOST = slice(40, 55)
+POSE = ("turn", "place", "angles", "scale", "error_mm", "score", "n_px", "centroid_mm")
+
+
+def mixed(n_animals: int, order: np.ndarray) -> Observations:
+    """Frames of animals whose components come in another order each time: slot s shows animal
+    order[t, s].
+    """
+    alone = [told(SECONDS, one) for one in WALKS[:n_animals]]
+    seen = Observations.empty(SUBJECT.skeleton, alone[0].times_ns, n_animals)
+    for k, one in enumerate(alone):
+        one.centroid_mm[:, :2] = WALKS[k].root.translation[:, None]
+        seen.objects[:, k, :3] = WALKS[k].root.translation
+        seen.objects[:, k, 3] = 2000.0
+        for s in range(n_animals):
+            rows = np.flatnonzero(order[:, s] == k)
+            for name in POSE:
+                getattr(seen, name)[rows, 2 * s : 2 * s + 2] = getattr(one, name)[rows, :2]
+    return seen
+
+
+def shuffled(n_animals: int) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return np.array([rng.permutation(n_animals) for _ in SECONDS])
+
+
+def named(order: np.ndarray, slots: np.ndarray) -> np.ndarray:
+    """Which animal each track shows in each frame."""
+    return np.take_along_axis(order, slots, axis=1)
+
+
+@pytest.mark.parametrize("n_animals", [2, 3])
+def test_each_animal_keeps_its_name_in_whatever_order_components_come(n_animals: int) -> None:
+    order = shuffled(n_animals)
+    seen = mixed(n_animals, order)
+    found = identify([seen] * n_animals, [SUBJECT] * n_animals, [2000.0] * n_animals)
+    names = named(order, found.slots)
+    assert (names == names[0]).all()
+    assert all(one.p_swap < 0.01 for one in found.crossings)
+    track = track_whole(SUBJECT, own_observations(seen, found.slots[:, 0])).track
+    assert joint_error(track.joints_mm, WALKS[names[0, 0]]).max() < 3.0
+
+
+def test_a_frame_that_shows_one_of_two_belongs_to_the_one_that_is_near() -> None:
+    order = shuffled(2)
+    seen = mixed(2, order)
+    for name in POSE[:-2]:
+        getattr(seen, name)[40, 2:] = np.nan
+    slots = identify([seen] * 2, [SUBJECT] * 2, [2000.0] * 2).slots
+    assert sorted(slots[40]) == [-1, 0]
+    near = int(np.flatnonzero(slots[40] == 0)[0])
+    assert order[40, 0] == order[39, slots[39, near]]
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.5])
+def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_it(
+    ratio: float,
+) -> None:
+    order = np.tile([0, 1], (len(SECONDS), 1))
+    seen = mixed(2, order)
+    lose(seen, LOST)
+    later = slice(LOST.stop, None)
+    middle = 0.5 * (seen.place[later, :1] + seen.place[later, 2:3])
+    seen.place[later] = middle + 0.15 * (seen.place[later] - middle)  # they part slowly
+    seen.n_px[:, :2] = round(800 * ratio)
+    areas = [2000.0 * ratio, 2000.0]
+    found = identify([seen] * 2, [SUBJECT] * 2, areas)
+    unclear = max(found.crossings, key=lambda one: one.p_swap)
+    if ratio == 1.0:
+        assert 0.2 < unclear.p_swap <= 0.5
+        assert "may have been exchanged at 1 of" in doubt(found.crossings)
+    else:
+        assert doubt(found.crossings) == ""
+        assert (found.slots[later] == found.slots[0]).all()
+        assert "size" in {one.decided_by for one in found.crossings}
+
+
+def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
+    track = track_whole(SUBJECT, told(SECONDS, WALKS[0])).track
+    unclear = Crossing(10, 20, (0, 1), 0.3, "motion")
+    flag_unclear(track, [unclear, Crossing(30, 40, (0, 1), 0.01, "motion")])
+    assert np.flatnonzero(track.flag == "doubtful").tolist() == list(range(10, 20))
+    assert doubt([Crossing(0, 1, (0, 1), 1.0 - CERTAIN - 1e-9, "motion")]) == ""
+    assert "70% certain" in doubt([unclear])

@@ -1,0 +1,69 @@
+"""Animals that touch are explained by their bodies together."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from liex_lab.pipelines.build import build_joint_tracker, build_tracker
+
+from liex_lab.errors import EstimationError
+from liex_lab.geometry import SE3
+from liex_lab.plan import Plan
+from liex_lab.simulation.recording import RenderedRecording
+from liex_lab.simulation.scenes.catalogue import film
+from liex_lab.tracking.joint import JointTracker
+
+TOUCH = slice(50, 58)
+MOUSE = Plan.load("mouse")
+
+
+@pytest.fixture(scope="module")
+def recording() -> RenderedRecording:
+    """Two mice, the second beside the first and as it stands in some frames."""
+    stage = film("two-animals", 3, 60).stage
+    first, second = stage.actors
+    move = SE3.identity(60)
+    side = np.cross([0.0, 0.0, 1.0], first.joints[:, -1] - first.joints[:, 0])
+    move.translation[:] = 24.0 * side / np.linalg.norm(side, axis=1, keepdims=True)
+    beside = first.pose.moved(move)
+    root = SE3(second.pose.root.rotation.copy(), second.pose.root.translation.copy())
+    angles = second.pose.angles.copy()
+    root.rotation[TOUCH] = beside.root.rotation[TOUCH]
+    root.translation[TOUCH] = beside.root.translation[TOUCH]
+    angles[TOUCH] = beside.angles[TOUCH]
+    pose = replace(second.pose, root=root, angles=angles)
+    return RenderedRecording("touch", replace(stage, actors=(first, replace(second, pose=pose))))
+
+
+@pytest.fixture(scope="module")
+def joint(recording: RenderedRecording) -> JointTracker:
+    return build_joint_tracker(recording, MOUSE, build_tracker(recording, MOUSE), 2)
+
+
+def test_both_bodies_lie_where_they_are_apart_and_side_by_side(
+    recording: RenderedRecording, joint: JointTracker
+) -> None:
+    frames = [recording.frame(k) for k in range(TOUCH.start - 4, TOUCH.stop)]
+    seen = joint.observe(frames)[0]
+    assert seen.known[:, ::2].all()
+    inverse = recording.stage.scene.T_arena_camera @ joint.scene.floor.T_arena_camera.inverse()
+    joints = inverse @ np.stack(
+        [seen.joints_as(h, range(seen.skeleton.n_joints)) for h in range(4)], axis=1
+    ).astype(float)
+    off = np.array(
+        [
+            np.linalg.norm(joints - actor.joints[TOUCH.start - 4 : TOUCH.stop, None], axis=-1)
+            for actor in recording.stage.actors
+        ]
+    ).mean(axis=-1)  # (animal, frame, hypothesis)
+    best = np.nanmin(off.reshape(2, len(frames), 2, 2), axis=-1)
+    own = np.minimum(best[0, :, 0] + best[1, :, 1], best[0, :, 1] + best[1, :, 0]) / 2.0
+    assert np.median(own[:4]) < 5.0
+    assert np.median(own[4:]) < 10.0
+
+
+def test_more_animals_than_stand_apart_are_refused(
+    recording: RenderedRecording, joint: JointTracker
+) -> None:
+    with pytest.raises(EstimationError, match=r"animal\.count is 3, but hardly a frame"):
+        build_joint_tracker(recording, MOUSE, joint.trackers[0], 3)
