@@ -21,7 +21,7 @@ from liex_lab.tracking._association_kernels import transition_cost
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.observations import COLUMNS, Array, Observations
 from liex_lab.tracking.smoother import TrackingParameters
-from liex_lab.tracking.track import Subject, Track, spans
+from liex_lab.tracking.track import Crossing, Subject, Tracked, spans
 
 Slots = NDArray[np.int64]
 
@@ -31,25 +31,6 @@ _SIZE_SD = 0.15  # of the logarithm of an animal's pixels, from posture to postu
 _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
 _JOIN_S = 0.5  # crossings nearer to each other are one
-
-
-@dataclass(frozen=True)
-class Crossing:
-    """Frames in which animals may have been exchanged.
-
-    Attributes:
-        start: first frame.
-        stop: frame after the last.
-        animals: which of them, from 0.
-        p_swap: probability that they leave it in other roles than the tracks say.
-        decided_by: what decided it: motion or size.
-    """
-
-    start: int
-    stop: int
-    animals: tuple[int, ...]
-    p_swap: float
-    decided_by: str
 
 
 @dataclass(frozen=True)
@@ -116,16 +97,11 @@ def own_observations(observed: Observations, slots: Slots) -> Observations:
     return own
 
 
-def flag_unclear(track: Track, crossings: Sequence[Crossing]) -> None:
-    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are.
-
-    Args:
-        track: of one of the animals.
-        crossings: in which it takes part.
-    """
-    for one in crossings:
+def flag_unclear(tracked: Tracked) -> None:
+    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are."""
+    for one in tracked.crossings or ():
         if one.p_swap > UNCLEAR:
-            flag = track.flag[one.start : one.stop]
+            flag = tracked.track.flag[one.start : one.stop]
             flag[flag == ""] = "doubtful"
 
 
