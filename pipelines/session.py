@@ -471,8 +471,6 @@ class Prepared:
         writer: SessionWriter,
         source: str | Path | Recording,
         notes: Mapping[str, Any] | None = None,
-        observed: observations.Observations | None = None,
-        crossings: Sequence[Crossing] | None = None,
     ) -> Session:
         """Make track, behaviour and tables, and move the session to its folder.
 
@@ -481,17 +479,47 @@ class Prepared:
             source: path or address of the recording, to which the session links; there is no link
                 to an open recording.
             notes: additional contents of session.json.
+        """
+        self.follow(writer)
+        return self.conclude(writer, source, notes)
+
+    def follow(
+        self,
+        writer: SessionWriter,
+        observed: observations.Observations | None = None,
+        crossings: Sequence[Crossing] | None = None,
+    ) -> None:
+        """Make the track of the animal and the verdict on it, and pass them to the writer.
+
+        Args:
+            writer: has all frames.
             observed: the observations of this animal; None uses those that the writer has.
             crossings: in which it may have been exchanged with another one; None if it is alone.
         """
         began = time.perf_counter()
         verdict = make_track(writer, self.fitted, observed, crossings)
         self.timings["track"] += time.perf_counter() - began
+        writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
+
+    def conclude(
+        self,
+        writer: SessionWriter,
+        source: str | Path | Recording,
+        notes: Mapping[str, Any] | None = None,
+        together: Interactions | None = None,
+    ) -> Session:
+        """Make behaviour and tables of a track, and move the session to its folder.
+
+        Args:
+            writer: has the track.
+            source: as for `finish`.
+            notes: additional contents of session.json.
+            together: the interactions of all animals of the arena; None for one animal.
+        """
         if isinstance(source, str | Path):
             writer.note(input=evidence.link_to(source, self.folder))
-        writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
         writer.note(**dict(notes or {}))
-        return conclude(writer, self.fitted.plan, self.timings)
+        return conclude(writer, self.fitted.plan, self.timings, together)
 
 
 def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) -> Prepared:
