@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.behaviour.interactions import Individual, find_interactions
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.plan import Plan, sections
 from liex_lab.plan.plan import toml_value
@@ -255,17 +256,22 @@ def _measure_animals(
         subjects = [prepared.fitted.tracker.subject for prepared in going.values()]
         areas = [prepared.fitted.tracker.scene.area_mm2 for prepared in going.values()]
         identity = identify(whole, subjects, areas)
+        for k, (prepared, writer) in enumerate(zip(going.values(), writers, strict=True)):
+            crossings = [one for one in identity.crossings if k in one.animals]
+            prepared.follow(writer, own_observations(whole[k], identity.slots[:, k]), crossings)
+        together = None
+        if subjects[0].skeleton.is_chain:
+            progress(0, None, "finding the interactions")
+            tracks = [
+                Individual.of_track(name, writer.track)
+                for name, writer in zip(going, writers, strict=True)
+            ]
+            limits = next(iter(going.values())).fitted.plan.interactions
+            index = writers[0].rows.frame_index
+            together = find_interactions(whole[0].seconds, tracks, limits, index)
         return {
-            name: prepared.finish(
-                writer,
-                recording,
-                notes,
-                own_observations(observed, identity.slots[:, k]),
-                [one for one in identity.crossings if k in one.animals],
-            ).path
-            for k, ((name, prepared), writer, observed) in enumerate(
-                zip(going.items(), writers, whole, strict=True)
-            )
+            name: prepared.conclude(writer, recording, notes, together).path
+            for (name, prepared), writer in zip(going.items(), writers, strict=True)
         }
 
 

@@ -66,6 +66,7 @@ from liex_lab.sessions.writer import (
 from liex_lab.tables.rows import Rows, bout_rows
 from liex_lab.tables.schema import BOUTS, empty_table
 from liex_lab.tracking import curve, identity, observations, trust
+from liex_lab.tracking.track import Crossing
 from liex_lab.tracking.tracker import FrameTracker
 
 from .build import (
@@ -470,8 +471,6 @@ class Prepared:
         writer: SessionWriter,
         source: str | Path | Recording,
         notes: Mapping[str, Any] | None = None,
-        observed: observations.Observations | None = None,
-        crossings: Sequence[identity.Crossing] = (),
     ) -> Session:
         """Make track, behaviour and tables, and move the session to its folder.
 
@@ -480,17 +479,47 @@ class Prepared:
             source: path or address of the recording, to which the session links; there is no link
                 to an open recording.
             notes: additional contents of session.json.
+        """
+        self.follow(writer)
+        return self.conclude(writer, source, notes)
+
+    def follow(
+        self,
+        writer: SessionWriter,
+        observed: observations.Observations | None = None,
+        crossings: Sequence[Crossing] | None = None,
+    ) -> None:
+        """Make the track of the animal and the verdict on it, and pass them to the writer.
+
+        Args:
+            writer: has all frames.
             observed: the observations of this animal; None uses those that the writer has.
-            crossings: in which it may have been exchanged with another one.
+            crossings: in which it may have been exchanged with another one; None if it is alone.
         """
         began = time.perf_counter()
         verdict = make_track(writer, self.fitted, observed, crossings)
         self.timings["track"] += time.perf_counter() - began
+        writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
+
+    def conclude(
+        self,
+        writer: SessionWriter,
+        source: str | Path | Recording,
+        notes: Mapping[str, Any] | None = None,
+        together: Interactions | None = None,
+    ) -> Session:
+        """Make behaviour and tables of a track, and move the session to its folder.
+
+        Args:
+            writer: has the track.
+            source: as for `finish`.
+            notes: additional contents of session.json.
+            together: the interactions of all animals of the arena; None for one animal.
+        """
         if isinstance(source, str | Path):
             writer.note(input=evidence.link_to(source, self.folder))
-        writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
         writer.note(**dict(notes or {}))
-        return conclude(writer, self.fitted.plan, self.timings)
+        return conclude(writer, self.fitted.plan, self.timings, together)
 
 
 def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) -> Prepared:
@@ -533,7 +562,7 @@ def make_track(
     writer: SessionWriter,
     fitted: Fitted,
     observed: observations.Observations | None = None,
-    crossings: Sequence[identity.Crossing] = (),
+    crossings: Sequence[Crossing] | None = None,
 ) -> Verdict:
     """Make the track of a session whose frames have all been measured, and pass it to the writer.
 
@@ -541,7 +570,7 @@ def make_track(
         writer: has all frames.
         fitted: plan, recording and tracker.
         observed: the observations of the animal; None uses those that the writer has.
-        crossings: in which it may have been exchanged with another one.
+        crossings: in which it may have been exchanged with another one; None if it is alone.
 
     Returns:
         The verdict on the session.
@@ -549,7 +578,9 @@ def make_track(
     tracker = fitted.tracker
     whole = observed or writer.observations(observations.Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
-    identity.flag_unclear(tracked.track, crossings)
+    if crossings is not None:
+        tracked = replace(tracked, crossings=tuple(crossings))
+        identity.flag_unclear(tracked)
     subject = tracker.subject
     recording = fitted.recording
     fast = trust.why_too_fast(tracked.track, subject.length_mm)
@@ -569,7 +600,7 @@ def make_track(
             *tracker.scene.doubts,
             *recording.doubts,
             *recording.clock_doubts,
-            *filter(None, [fast, centre if at_edge else "", identity.doubt(crossings)]),
+            *filter(None, [fast, centre if at_edge else "", identity.doubt(crossings or ())]),
             *frozen,
             *recording.files.rewritten(),
         ),

@@ -58,5 +58,5 @@ for scene, (error, session) in rows.items():
     print(f"{scene:12} true {np.nanmedian(error):5.1f} mm, expected {expected:4.1f} mm (medians)")
 
 # %%
-# Two animals are reported, and one of them is followed. All known limits are listed in
+# Two animals are reported, and no pose of a single one is trusted. All known limits are listed in
 # docs/concepts/how-it-fails.md.

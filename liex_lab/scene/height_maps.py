@@ -133,7 +133,7 @@ def _camera_centre(points: Array, crop_cameras: Array) -> Array:
 
 CROP = 96  # pixels per side of a height map
 N_OBJECTS = 4  # components of a frame that are described
-ANIMAL_HEIGHTS = (0.4, 2.5)  # mean height of an animal from the floor, over the usual one
+ANIMAL_HEIGHTS = (0.4, 2.0)  # mean height of an animal from the floor, over the usual one
 
 
 @dataclass(frozen=True)

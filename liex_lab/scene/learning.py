@@ -546,7 +546,7 @@ def _moving_area(scene: Scene, sample: Depths, target: TargetAnimal) -> tuple[fl
 def count_in_sample(scene: Scene, sample: Depths) -> tuple[int, float]:
     """How many animals are in view at once in a fifth of the frames that show any.
 
-    Counted are the components of about the animal's size that are 0.4 to 2.5 times as high as usual
+    Counted are the components of about the animal's size that are 0.4 to 2 times as high as usual
     and do not stand at one position in half of the frames.
 
     Args:
@@ -563,7 +563,7 @@ def count_in_sample(scene: Scene, sample: Depths) -> tuple[int, float]:
     if scene.view.frame == VIEWS[0]:
         height = objects[..., 2] / np.median(objects[known[:, 0], 0, 2])
         known &= (height > ANIMAL_HEIGHTS[0]) & (height < ANIMAL_HEIGHTS[1])
-    reach = 0.3 * np.sqrt(scene.area_mm2)
+    reach = 0.1 * np.sqrt(scene.area_mm2)  # less than a resting animal moves its head
     for i, k in zip(*np.nonzero(known[:, 1:]), strict=True):  # the first is the animal
         off = np.linalg.norm(objects[..., :2] - objects[i, k + 1, :2], axis=-1)
         known[i, k + 1] = (off < reach).any(axis=1).mean() < _OFTEN

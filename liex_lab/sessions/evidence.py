@@ -28,7 +28,7 @@ from liex_lab.sessions.verdict import SUBJECT
 from liex_lab.tables import schema as tables
 from liex_lab.tables.rows import NOT_FROM_CAMERA, Rows, median_step, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations
-from liex_lab.tracking.track import Flip, Subject, Track
+from liex_lab.tracking.track import Crossing, Flip, Subject, Track
 
 Array = NDArray[np.float64]
 
@@ -44,11 +44,13 @@ class Results:
         origin: provenance of the recording.
         rows: the track in the form of the tables.
         flips: intervals in which head and tail may be exchanged.
+        crossings: those with other animals; None if it was measured alone.
     """
 
     origin: Provenance
     rows: Rows
     flips: Sequence[Flip] = ()
+    crossings: Sequence[Crossing] | None = None
 
     def write_track(self, folder: Path) -> None:
         """Write the tables of the track itself: frames, poses, rotations, gaps, flips, sessions.
@@ -66,6 +68,8 @@ class Results:
             "flips": [rows.flips(self.flips)],
             "sessions": [self.session_row()],
         }
+        if self.crossings is not None:
+            own["crossings"] = [rows.crossings(self.crossings)]
         for name, blocks in own.items():
             tables.write_table(folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
 

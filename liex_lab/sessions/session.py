@@ -50,6 +50,7 @@ FILES = {  # of a session, and whether every version writes it
     "bouts.parquet": True,
     "gaps.parquet": True,
     "flips.parquet": True,
+    "crossings.parquet": False,
     "sessions.parquet": True,
     "summary.csv": False,
     "transitions.parquet": False,
@@ -209,6 +210,11 @@ class Session:
 
     flips = _table(
         "flips", "Table `flips`, one row per interval in which head and tail may be exchanged."
+    )
+
+    crossings = _table(
+        "crossings",
+        "Table `crossings` of one of several animals, one row per meeting with another one.",
     )
 
     transitions = _table(

@@ -51,7 +51,7 @@ from liex_lab.sessions.session import Session
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.track import Flip, Subject, Track, Tracked
+from liex_lab.tracking.track import Crossing, Flip, Subject, Track, Tracked
 
 INDEX = "frame_index"
 TIMES = "frame_time_ns"
@@ -111,6 +111,7 @@ class SessionWriter:
         self._track = Track.empty(origin.skeleton, np.zeros(0, np.int64))
         self._rows: Rows | None = None
         self._flips: Sequence[Flip] = ()
+        self._crossings: Sequence[Crossing] | None = None
         self._candidates: Observations | None = None
         self._together: Observations | None = None
         self._thumbnails = Thumbnails()
@@ -295,6 +296,7 @@ class SessionWriter:
         """
         self.track = tracked.track
         self._flips = tracked.flips
+        self._crossings = tracked.crossings
         memory.release_memory()  # much memory after a long recording
         self._candidates = observations if self.origin.replay_candidates else None
         self._together = observations if subject.n_rivals > 1 else None
@@ -368,7 +370,7 @@ class SessionWriter:
                 "kinematics": rows.frames_table.iloc[:, :5],
             }
         bouts = results["bouts"]
-        of_track = Results(self.origin, rows, self._flips)
+        of_track = Results(self.origin, rows, self._flips, self._crossings)
         of_track.write_track(self._folder)
         of_track.write_measured(self._folder, results, columns)
         memory.release_memory()

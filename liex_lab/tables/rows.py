@@ -32,7 +32,7 @@ from liex_lab.tables.schema import (
     Block,
     to_pandas,
 )
-from liex_lab.tracking.track import Flip, Track
+from liex_lab.tracking.track import Crossing, Flip, Track
 
 Array = NDArray[np.float64]
 
@@ -249,6 +249,28 @@ class Rows:
             "applied": np.array([flip.applied for flip in flips], bool),
             "source": np.array([flip.source for flip in flips], str),
             "undone_at": np.array([flip.undone_at for flip in flips], str),
+        }
+
+    def crossings(self, crossings: Sequence[Crossing]) -> Block:
+        """The table `crossings`, a block with one row for each crossing.
+
+        Args:
+            crossings: in which the animal takes part, in order of time.
+        """
+        time = self.time_s
+        count = frame_count(self.frame_index)
+        stops = stop_times(time)
+        return {
+            **self._keys,
+            "start_s": np.array([time[one.start] for one in crossings]),
+            "stop_s": np.array([stops[one.stop - 1] for one in crossings]),
+            "start_frame": np.array([count[one.start] for one in crossings], np.int64),
+            "stop_frame": np.array([count[one.stop] for one in crossings], np.int64),
+            "animals": np.array(
+                [";".join(f"animal{k + 1}" for k in one.animals) for one in crossings], str
+            ),
+            "p_swap": np.array([one.p_swap for one in crossings], float),
+            "decided_by": np.array([one.decided_by for one in crossings], str),
         }
 
     def _camera_gaps(self) -> list[_Found]:

@@ -136,9 +136,9 @@ class Vocabulary:
 BEHAVIOUR = ("kinematics", "bouts", "summary", "transitions", "zones", "activity")
 TABLES: dict[str, tuple[Column, ...]] = {
     name: table_columns(name)
-    for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "sessions")
+    for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "crossings", "sessions")
 }
-FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS = TABLES.values()
+FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, CROSSINGS, SESSIONS = TABLES.values()
 SYNCED = {  # on the clock of another instrument, see `sessions.clock`; by table
     name: tuple(_column(line, {}) for line in _listed()[name] if line["when"] == "synced")
     for name in ("frames", "bouts")
@@ -422,7 +422,7 @@ _LATER = {
     "gaps": {"x_mm", "y_mm"},
 }
 _FEW = 10_000
-_SPANS = {"bouts", "gaps", "flips", "interactions"}
+_SPANS = {"bouts", "gaps", "flips", "crossings", "interactions"}
 # our types in Parquet, and their kinds in pandas
 _STORED = {"string": "BYTE_ARRAY", "float64": "DOUBLE", "int64": "INT64", "bool": "BOOLEAN"}
 _KINDS = {"string": "O", "float64": "f", "int64": "i", "bool": "b"}

@@ -3,7 +3,7 @@
 No body is fitted, so an animal of any build counts. The components of about the animal's size
 (`Observations.objects`) are linked from frame to frame: mutual nearest neighbours within a gate of
 distance and area, and connected components of these links (tracklets). A tracklet is an animal's if
-it moves by more than half the root of its area and is 0.4 to 2.5 times as high as usual; so is a
+it moves by more than half the root of its area and is 0.4 to 2 times as high as usual; so is a
 tracklet at rest that begins or ends where an animal's ends or begins. Animals that touch are one
 component: the sum of all areas then shows how many there are, compared with the sum while they
 stand free.

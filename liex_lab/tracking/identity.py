@@ -21,35 +21,19 @@ from liex_lab.tracking._association_kernels import transition_cost
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.observations import COLUMNS, Array, Observations
 from liex_lab.tracking.smoother import TrackingParameters
-from liex_lab.tracking.track import Subject, Track, spans
+from liex_lab.tracking.track import Crossing, Subject, Tracked, spans
 
 Slots = NDArray[np.int64]
 
 UNCLEAR = 0.1  # probability of an exchange above which poses are not trusted
 CERTAIN = 0.9  # least certainty for statistics per animal
 _SIZE_SD = 0.15  # of the logarithm of an animal's pixels, from posture to posture
+_GAP_S = 0.1  # time without all animals in view over which they are continued
+_VELOCITY_S = 0.2  # time over which their velocity is measured
+_PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
 _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
 _JOIN_S = 0.5  # crossings nearer to each other are one
-
-
-@dataclass(frozen=True)
-class Crossing:
-    """Frames in which animals may have been exchanged.
-
-    Attributes:
-        start: first frame.
-        stop: frame after the last.
-        animals: which of them, from 0.
-        p_swap: probability that they leave it in other roles than the tracks say.
-        decided_by: what decided it: motion or size.
-    """
-
-    start: int
-    stop: int
-    animals: tuple[int, ...]
-    p_swap: float
-    decided_by: str
 
 
 @dataclass(frozen=True)
@@ -91,6 +75,8 @@ def identify(
         transition = moves[:, animals, states[:, None, :], states[None, :, :]].sum(axis=-1)
         emission = _sizes(observed[0][full], np.array(areas_mm2), states)
         path = _viterbi(transition, emission)
+        _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
+        path = _viterbi(transition, emission)
         slots[full] = states[path]
         crossings = _crossings(observed[0], full, transition, emission, path, states)
     _follow(observed, subjects, slots, known)
@@ -116,16 +102,11 @@ def own_observations(observed: Observations, slots: Slots) -> Observations:
     return own
 
 
-def flag_unclear(track: Track, crossings: Sequence[Crossing]) -> None:
-    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are.
-
-    Args:
-        track: of one of the animals.
-        crossings: in which it takes part.
-    """
-    for one in crossings:
+def flag_unclear(tracked: Tracked) -> None:
+    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are."""
+    for one in tracked.crossings or ():
         if one.p_swap > UNCLEAR:
-            flag = track.flag[one.start : one.stop]
+            flag = tracked.track.flag[one.start : one.stop]
             flag[flag == ""] = "doubtful"
 
 
@@ -174,6 +155,42 @@ def _transitions(seconds, joints, error, costs, out):
                                 costs,
                             )
                             out[t, i, j] = min(out[t, i, j], cost)
+
+
+def _through_gaps(
+    observed: Observations, subject: Subject, slots: Slots, transition: Array, states: Slots
+) -> None:
+    """Replace the costs (m - 1, S, S) of transitions over frames that do not show all animals.
+
+    Both sides are continued by an integrated Ornstein-Uhlenbeck process, the smoother's model of
+    motion: an animal that walks into another one is likely to walk on.
+    """
+    motion = TrackingParameters.of(subject.skeleton.name).motion
+    fade = motion.position_decay_s
+    seconds = observed.seconds
+    places = observed.centroid_mm[:, ::2, :2].astype(float)
+    own = np.take_along_axis(places, slots[..., None], axis=1)  # (m, N, 2) animal by animal
+    for t in np.flatnonzero(np.diff(seconds) > _GAP_S).tolist():
+        passed = seconds[t + 1] - seconds[t]
+        left = fade * (1.0 - np.exp(-passed / fade))
+        drift = passed - 2.0 * left + 0.5 * fade * (1.0 - np.exp(-2.0 * passed / fade))
+        variance = motion.position_variance[0] * subject.length_mm**2 * fade**2 * drift
+        ahead = own[t] + left * _velocity(own, seconds, t, -1)
+        back = own[t + 1] - left * _velocity(own, seconds, t + 1, 1)
+        sd2 = variance + (_PLACE_SHARE * subject.length_mm) ** 2
+        # cost (N, N) of the animal of each component becoming that of another one
+        cost = np.empty((len(slots[t]),) * 2)
+        off = (ahead[:, None] - own[t + 1]) ** 2 + (own[t][:, None] - back) ** 2
+        cost[np.ix_(slots[t], slots[t + 1])] = 0.25 * off.sum(axis=-1) / sd2
+        transition[t] = cost[states[:, None, :], states[None, :, :]].sum(axis=-1)
+
+
+def _velocity(own: Array, seconds: Array, t: int, side: int) -> Array:
+    """Velocity (N, 2) mm/s of animals at positions (m, N, 2), from the frames on one side of t."""
+    rows = np.flatnonzero(side * (seconds - seconds[t]) >= 0.0)
+    rows = rows[np.abs(seconds[rows] - seconds[t]) < _VELOCITY_S]
+    since = seconds[rows] - seconds[rows].mean()
+    return np.asarray(np.tensordot(since, own[rows], 1) / max(float(since @ since), 1e-9))
 
 
 def _sizes(observed: Observations, areas_mm2: Array, states: Slots) -> Array:

@@ -241,6 +241,25 @@ def ends_of(spans: Iterable[tuple[int, int]]) -> list[int]:
 
 
 @dataclass(frozen=True)
+class Crossing:
+    """Frames in which animals may have been exchanged.
+
+    Attributes:
+        start: first frame.
+        stop: frame after the last.
+        animals: which of them, from 0.
+        p_swap: probability that they leave it in other roles than the tracks say.
+        decided_by: what decided it: motion or size.
+    """
+
+    start: int
+    stop: int
+    animals: tuple[int, ...]
+    p_swap: float
+    decided_by: str
+
+
+@dataclass(frozen=True)
 class Tracked:
     """A track, its exchanges of head and tail, and the animals in view.
 
@@ -251,6 +270,7 @@ class Tracked:
             makes a half turn there.
         n_animals: animals in view at once.
         n_animals_share: share of the frames with an animal in view that show this number.
+        crossings: in which the animal takes part; None if it was measured alone.
     """
 
     track: Track
@@ -258,6 +278,7 @@ class Tracked:
     cuts: tuple[int, ...] = ()
     n_animals: int = 1
     n_animals_share: float = 1.0
+    crossings: tuple[Crossing, ...] | None = None
 
 
 # The subject of a track.

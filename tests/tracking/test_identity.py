@@ -1,18 +1,20 @@
 """Each of several animals keeps its name; where that is unclear, its exchange has a probability."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.identity import (
     CERTAIN,
-    Crossing,
     doubt,
     flag_unclear,
     identify,
     own_observations,
 )
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.track import Crossing
 from tests.tracking.stories import SUBJECT, joint_error, lose, told, walk
 
 SECONDS = np.arange(90) / 30.0
@@ -95,9 +97,10 @@ def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_i
 
 
 def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
-    track = track_whole(SUBJECT, told(SECONDS, WALKS[0])).track
     unclear = Crossing(10, 20, (0, 1), 0.3, "motion")
-    flag_unclear(track, [unclear, Crossing(30, 40, (0, 1), 0.01, "motion")])
-    assert np.flatnonzero(track.flag == "doubtful").tolist() == list(range(10, 20))
+    clear = Crossing(30, 40, (0, 1), 0.01, "motion")
+    tracked = replace(track_whole(SUBJECT, told(SECONDS, WALKS[0])), crossings=(unclear, clear))
+    flag_unclear(tracked)
+    assert np.flatnonzero(tracked.track.flag == "doubtful").tolist() == list(range(10, 20))
     assert doubt([Crossing(0, 1, (0, 1), 1.0 - CERTAIN - 1e-9, "motion")]) == ""
     assert "70% certain" in doubt([unclear])
