@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.evaluation.paper.run import run_tables
     from liex_lab.pipelines.evaluation.scale import run_scale, write_long
     from liex_lab.pipelines.evaluation.scenes import evaluate_scenes
+    from liex_lab.pipelines.evaluation.several import evaluate_several
     from liex_lab.pipelines.evaluation.tracking import evaluate_tracking
     from liex_lab.pipelines.live import follow_live
     from liex_lab.pipelines.points import import_animals, import_points
@@ -49,6 +50,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "run_scale": "evaluation.scale",
     "evaluate_tracking": "evaluation.tracking",
     "evaluate_scenes": "evaluation.scenes",
+    "evaluate_several": "evaluation.several",
     "evaluate_actions": "evaluation.actions",
     "evaluate_tracks": "evaluation.actions",
     "run_tables": "evaluation.paper.run",
@@ -103,6 +105,7 @@ __all__ = [  # noqa: RUF022 - in the order of the manual
     "run_scale",
     "evaluate_tracking",
     "evaluate_scenes",
+    "evaluate_several",
     "evaluate_actions",
     "run_tables",
 ]

@@ -484,6 +484,52 @@ def evaluate_scenes(
     )
 
 
+@benchmark("several", lambda result: print_rows(flat_rows(result["rows"])))
+def evaluate_several(
+    animals: Annotated[
+        int, typer.Option("--animals", min=2, max=4, help="Number of mice in each recording.")
+    ] = 2,
+    n_frames: Annotated[
+        int, typer.Option("--frames", min=300, help="Number of frames of each recording.")
+    ] = 1800,
+    n_recordings: Annotated[
+        int, typer.Option("--recordings", min=1, max=12, help="Number of recordings.")
+    ] = 6,
+    sealed: Annotated[
+        bool,
+        typer.Option("--sealed", help="Use the held-out split; not for development."),
+    ] = False,
+    only_true: Annotated[
+        bool,
+        typer.Option("--only-true", help="Only score the interactions of true joints."),
+    ] = False,
+    *,
+    progress: Progress,
+) -> Result:
+    """Measure rendered groups of mice: identity, errors in contact, who did what to whom."""
+    return api.evaluate_several(
+        animals,
+        n_frames=n_frames,
+        n_recordings=n_recordings,
+        sealed=sealed,
+        measure=not only_true,
+        progress=progress,
+    )
+
+
+def flat_rows(rows: Result) -> Result:
+    """Rows whose tables of scores are columns of their own."""
+    return {
+        name: {
+            key if column == key else f"{key} {column.removeprefix('interactions_')}": number
+            for column, value in row.items()
+            for key, number in (value if isinstance(value, dict) else {column: value}).items()
+            if not isinstance(number, dict)
+        }
+        for name, row in rows.items()
+    }
+
+
 @benchmark("live")
 def evaluate_live(
     animal: AnimalName = "fish",

@@ -510,7 +510,7 @@ class InteractionThresholds(SettingsTable):
         description="approaches end and leaving begins at this distance of the skins (deepof: 25)",
     )
     avoid_mm: Positive = Field(
-        100.0, description="an animal avoids another that comes within this distance of the skins"
+        150.0, description="an animal avoids another that comes within this distance of the skins"
     )
     isolated_mm: Positive = Field(
         100.0, description="an animal farther from all others is isolated ..."
@@ -522,7 +522,7 @@ class InteractionThresholds(SettingsTable):
     )
     follow_s: Positive = Field(0.5, description="... within this time (deepof: 0.5) ...")
     follow_angle_rad: Positive = Field(
-        0.785, description="... and head the same way within this angle (LMT: 45 degrees)"
+        1.05, description="... and head the same way within this angle (LMT: 0.785)"
     )
     mount_above_mm: Positive = Field(
         10.0,
@@ -532,7 +532,7 @@ class InteractionThresholds(SettingsTable):
         1.05, description="... and it heads the same way within this angle"
     )
     still_mm_s: Positive = Field(20.0, description="animals that huddle are slower ...")
-    huddle_s: NotNegative = Field(2.0, description="... and touch for at least this time")
+    huddle_s: NotNegative = Field(3.0, description="... and touch for at least this time")
     moving_mm_s: Positive = Field(
         50.0,
         description="a slower animal stands (LMT: 50): it neither follows, approaches nor leaves",

@@ -21,6 +21,7 @@ from liex_lab.simulation.foreign import KINDS, SEALED_BODY, ForeignRecording
 from liex_lab.simulation.hand.simulator import HandSpecies, find_reference
 from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
+from liex_lab.simulation.scenes.groups import ENCOUNTERS, film_group
 from liex_lab.simulation.sensors import BY_NAME, Sensor
 from liex_lab.simulation.species import FishSpecies, GenericSpecies, MouseSpecies, Species
 
@@ -126,7 +127,7 @@ def tracking_sequence(
 
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
 _SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
-_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, "scene", "foreign")
+_KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, "scene", "pair", "foreign")
 _SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
 _BUILDS = ("other", "train")  # builds of animals in scenes: not used in training, or used
@@ -142,7 +143,10 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     of a mouse, or with animal=fish or animal=hand of those; with a
     seed or more frames they are new sequences of the same kind. scene is one of
     `simulation.scenes`, such as synthetic:scene?name=raised&seed=3; build=train uses a training
-    body. foreign is a body that does not come from the training's generator, such as
+    body. pair are two to four mice that interact, such as
+    synthetic:pair?seed=3&animals=3&apart=0.15&act=follow, see `simulation.scenes.groups`: apart is
+    the difference in length between one and the next. foreign is a body that does not come from
+    the training's generator, such as
     synthetic:foreign?animal=fish&body=2&seed=1, see `simulation.foreign`.
 
     Args:
@@ -166,6 +170,8 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     session: Recording
     if kind == "scene":
         session = _open_scene(address, stated)
+    elif kind == "pair":
+        session = _open_pair(address, stated)
     elif kind == "foreign":
         settings: dict[str, _Setting] = {
             "animal": (str, KINDS.__contains__, f"one of {', '.join(KINDS)}"),
@@ -219,16 +225,37 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
     settings = _settings(kind, Skeleton.load(plan).length, 20_000)
     if plan != "mouse":
         settings.pop("sensor", None)
+    return film(named, **_unsealed(address, stated, settings))
+
+
+def _open_pair(address: str, stated: dict[str, str]) -> Recording:
+    """The recording of a group's address."""
+    settings = _settings("walk", Skeleton.load("mouse").length, 20_000)
+    settings["animals"] = (int, lambda n: 2 <= n <= 4, "2, 3 or 4")
+    settings["apart"] = (float, lambda share: 0.0 <= share <= 0.3, "a share from 0 to 0.3")
+    settings["act"] = (str, ENCOUNTERS.__contains__, f"one of {', '.join(ENCOUNTERS)}")
+    values = _unsealed(address, stated, settings)
+    if act := values.pop("act", ""):
+        values["encounters"] = (act,)
+    return film_group(**values)[0]
+
+
+def _unsealed(
+    address: str, stated: dict[str, str], settings: dict[str, _Setting]
+) -> dict[str, Any]:
+    """The values of a scene's address as `film` takes them.
+
+    Raises:
+        RecordingError: a value is invalid, or the seed is kept for sealed evaluations.
+    """
     settings["build"] = (str, lambda build: build in _BUILDS, f"one of {', '.join(_BUILDS)}")
-    values = _values(address, stated, settings)
-    seed = values.pop("seed", 0)
-    if seed >= SEALED_FROM:
+    values = {"seed": 0, "frames": 300, "build": _BUILDS[0], **_values(address, stated, settings)}
+    if values["seed"] >= SEALED_FROM:
         raise RecordingError(
-            f"{address}: seeds from {SEALED_FROM} on are kept for `liex evaluate scenes --sealed`; "
-            "take a smaller one"
+            f"{address}: seeds from {SEALED_FROM} on are kept for `liex evaluate scenes --sealed` "
+            "and `liex evaluate several --sealed`; take a smaller one"
         )
-    family = values.pop("build", _BUILDS[0])
-    return film(named, seed, values.pop("frames", 300), family=family, **values)
+    return values | {"n_frames": values.pop("frames"), "family": values.pop("build")}
 
 
 def _values(address: str, stated: dict[str, str], settings: dict[str, _Setting]) -> dict[str, Any]:

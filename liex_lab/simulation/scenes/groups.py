@@ -6,7 +6,7 @@ postures are those of `stage.draw_mouse`. Truth are the intentions of the script
 distances: thresholds of the rules that are to be scored play no part.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -65,13 +65,11 @@ class Group:
     Args:
         rng: random number generator.
         arena: the arena.
-        spines: length of each animal, mm.
+        spines: (A,) length of each animal, mm.
     """
 
-    def __init__(
-        self, rng: np.random.Generator, arena: SimulatedScene, spines: Sequence[float]
-    ) -> None:
-        self.rng, self.arena, self.spine = rng, arena, np.array(spines)
+    def __init__(self, rng: np.random.Generator, arena: SimulatedScene, spines: Array) -> None:
+        self.rng, self.arena, self.spine = rng, arena, spines
         self.acts: list[Act] = []
         self.rows: list[Array] = []  # of each frame (A, 5): x, y, heading, resting, mounting
         self.at = np.zeros((len(spines), 2))
@@ -80,16 +78,18 @@ class Group:
         self.way = rng.uniform(-np.pi, np.pi, len(spines))
         self.resting, self.mounting = np.zeros((2, len(spines)))
 
-    def _spot(self, who: int, apart_mm: float = 130.0) -> Array:
-        """A free place away from all other animals."""
-        others = np.arange(len(self.at)) != who
-        spots = [free_spot(self.rng, self.arena, 0.8 * float(self.spine[who])) for _ in range(12)]
-        room = [np.linalg.norm(self.at[others] - spot, axis=1).min() for spot in spots]
-        return (
-            spots[int(np.argmax(np.array(room) > apart_mm))]
-            if max(room) > apart_mm
-            else (spots[int(np.argmax(room))])
-        )
+    def _spot(
+        self, who: int, apart_mm: float = 130.0, middle: Array | None = None, far_mm: float = 0.0
+    ) -> Array:
+        """A free place, away from all other animals and `far_mm` from a point, or the best."""
+        others = self.at[np.arange(len(self.at)) != who]
+        spots = [free_spot(self.rng, self.arena, 0.8 * float(self.spine[who])) for _ in range(24)]
+        room = [np.linalg.norm(others - spot, axis=1).min() / apart_mm for spot in spots]
+        if middle is not None:
+            far = [float(np.linalg.norm(spot - middle)) / far_mm for spot in spots]
+            room = [min(one) for one in zip(room, far, strict=True)]
+        good = np.array(room) > 1.0
+        return spots[int(np.argmax(good if good.any() else room))]
 
     def ahead(self, who: int) -> Array:
         """Unit vector of an animal's heading."""
@@ -122,14 +122,14 @@ class Group:
     def walk(
         self,
         who: int,
-        goal: Callable[[], Array],
+        goal: Array,
         mm_s: float,
         shy: Sequence[int] = (),
-        near_mm: float = 6.0,
+        near_mm: float = 3.0,
     ) -> None:
         """Walk to a goal, at most 6 s."""
         for _ in range(180):
-            left = self.step(who, goal(), mm_s, shy)
+            left = self.step(who, goal, mm_s, shy)
             self.frame()
             if left < near_mm:
                 return
@@ -157,22 +157,27 @@ def _meet(group: Group, agent: int, target: int, place: Array, turn: float) -> i
     """Approach an animal that stands in the middle: go straight to a place (forward, left; mm) in
     its frame, then stand at an angle `turn` to it; returns the frame of arrival.
     """
-    others = [k for k in range(len(group.at)) if k != agent]
+    every = range(len(group.at))
+    others = [k for k in every if k != agent]
     middle = group.arena.centre + group.rng.uniform(-25.0, 25.0, 2)
-    for k in range(len(group.at)):
-        if k != target and np.linalg.norm(group.at[k] - middle) < 150.0:
-            spot = group._spot(k, 150.0)
-            group.walk(k, lambda spot=spot: spot, 200.0, [one for one in others if one != k])
-    group.walk(target, lambda: middle, 150.0, [k for k in range(len(group.at)) if k != target])
+    for k in every:
+        room = 150.0 if k == agent else 190.0
+        if k != target and np.linalg.norm(group.at[k] - middle) < room:
+            spot = group._spot(k, 150.0, middle, room)
+            group.walk(k, spot, 200.0, [one for one in every if one != k])
+    group.walk(target, middle, 150.0, [k for k in every if k != target])
+    toward = group.at[agent] - group.at[target]
+    side = np.arctan2(toward[1], toward[0]) + group.rng.uniform(-0.5, 0.5)
+    group.face(target, float(side - np.arctan2(place[1], place[0])))
     ahead = group.ahead(target)
     goal = group.at[target] + place[0] * ahead + place[1] * np.array([-ahead[1], ahead[0]])
     out = (goal - middle) / np.linalg.norm(goal - middle)
     start = goal + float(group.rng.uniform(90.0, 120.0)) * out
-    group.walk(agent, lambda: start, 180.0, others, near_mm=15.0)
+    group.walk(agent, start, 180.0, others, near_mm=15.0)
     group.face(agent, float(np.arctan2(-out[1], -out[0])))
     group.wait(0.2)
     begun, mm_s = len(group.rows), float(group.rng.uniform(110.0, 220.0))
-    group.walk(agent, lambda: goal, mm_s)
+    group.walk(agent, goal, mm_s)
     group.act(agent, target, "approach", begun)
     arrived = len(group.rows)
     group.face(agent, group.way[target] + turn)
@@ -182,14 +187,17 @@ def _meet(group: Group, agent: int, target: int, place: Array, turn: float) -> i
 def _leave(group: Group, agent: int, target: int, fast: bool = False) -> None:
     """Go straight away from another animal; it runs if `fast`."""
     away = group.at[agent] - group.at[target]
-    way = float(np.arctan2(away[1], away[0])) + group.rng.uniform(-0.5, 0.5)
     far = float(group.rng.uniform(*((150.0, 180.0) if fast else (110.0, 150.0))))
-    goal = group.at[agent] + far * np.array([np.cos(way), np.sin(way)])
+    ways = np.arctan2(away[1], away[0]) + group.rng.uniform(-0.8, 0.8, 8)
+    goals = group.at[agent] + far * np.stack([np.cos(ways), np.sin(ways)], axis=1)
+    others = np.delete(group.at, agent, axis=0)
+    room = np.linalg.norm(goals[:, None] - others, axis=2).min(axis=1)
+    way, goal = float(ways[room.argmax()]), goals[room.argmax()]
     if not fast:
         group.face(agent, way)
     begun = len(group.rows)
     mm_s = float(group.rng.uniform(450.0, 550.0) if fast else group.rng.uniform(110.0, 220.0))
-    group.walk(agent, lambda: goal, mm_s, near_mm=10.0)
+    group.walk(agent, goal, mm_s, near_mm=10.0)
     group.act(agent, target, "escape" if fast else "leave", begun)
 
 
@@ -241,7 +249,7 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
         group.wait(0.5)
         group.act(agent, target, "nose_to_tail_base", begun)
         ride = group.at[target] + (0.45 * spines[agent] - 0.45 * other - 8.0) * group.ahead(target)
-        group.walk(agent, lambda: ride, 120.0)
+        group.walk(agent, ride, 120.0)
         begun = len(group.rows)
         group.mounting[agent] = 1.0
     group.wait(seconds)
@@ -310,62 +318,56 @@ def _shun(group: Group, agent: int, target: int) -> None:
         group.step(target, group.at[agent].copy(), 110.0)
         group.frame()
     group.act(agent, target, "avoid", begun)
-    group.walk(agent, lambda: goal, 200.0, [target], near_mm=15.0)
+    group.walk(agent, goal, 200.0, [target], near_mm=15.0)
 
 
 @dataclass(frozen=True)
-class GroupMaking(Making):
+class _Making(Making):
     """Builds one recording of a group.
 
     Attributes:
-        encounters: the acts that are played in turn, of `ENCOUNTERS`.
-        apart: difference in length between one animal and the next, share.
+        group: its paths.
     """
 
-    encounters: Sequence[str] = ENCOUNTERS
-    apart: float = 0.0
-
-    def group(self, arena: SimulatedScene) -> Group:
-        """The paths of the group in at least `n_frames` frames."""
-        rng = np.random.default_rng([self.seed, 78])
-        base = self.spine_mm or float(rng.uniform(60.0, 74.0))
-        n = self.recipe.n_animals
-        group = Group(rng, arena, base * (1.0 + self.apart) ** -np.arange(n))
-        while len(group.rows) < self.n_frames:
-            for action in rng.permutation(self.encounters):
-                agent, target = rng.permutation(n)[:2]
-                group.wait(float(rng.uniform(0.5, 1.0)))
-                _play(group, int(agent), int(target), str(action))
-        return group
+    group: Group
 
     def _cast(
         self, species: MouseSpecies, arenas: list[SimulatedScene]
     ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals of the group, and nothing else."""
-        group = self.group(arenas[0])
-        n = self.n_frames
-        rows = np.stack(group.rows)[:n]
-        timing = timing_of("always", n)
-        animals = []
-        for which, spine in enumerate(group.spine):
-            path = rows[:, which]
-            place = smoothed(path[:, :2], 2.0)
-            heading = smoothed(np.unwrap(path[:, 2]), 2.0)
-            speed = np.linalg.norm(np.gradient(place, axis=0), axis=1) * _HZ / spine
-            kinds = np.where(path[:, 3] > 0, _HUNCH, 0)
-            animal = draw_mouse(
-                self.seed,
-                which,
-                species,
-                arenas[0],
-                self.family,
-                float(spine),
-                timing,
-                lambda rng, m, kinds=kinds, speed=speed: (kinds, speed),
-                lambda rng, scene, mm, pace, place=place, heading=heading: (place, heading),
-            )
-            animals.append(_risen(animal, smoothed(path[:, 4], 4.0)))
-        return animals, [], []
+        paths = np.stack(self.group.rows[: self.n_frames], axis=1)
+        return [self._mouse(k, path, species, arenas[0]) for k, path in enumerate(paths)], [], []
+
+    def _mouse(
+        self, which: int, path: Array, species: MouseSpecies, arena: SimulatedScene
+    ) -> Actor:
+        """An animal on its path (n, 5), see `Group.rows`."""
+        spine = float(self.group.spine[which])
+        place, heading = smoothed(path[:, :2], 2.0), smoothed(np.unwrap(path[:, 2]), 2.0)
+        speed = np.linalg.norm(np.gradient(place, axis=0), axis=1) * _HZ / spine
+        kinds = np.where(path[:, 3] > 0, _HUNCH, 0)
+        animal = draw_mouse(
+            self.seed,
+            which,
+            species,
+            arena,
+            self.family,
+            spine,
+            timing_of("always", self.n_frames),
+            lambda rng, n: (kinds, speed),
+            lambda rng, scene, spine_mm, mm_s: (place, heading),
+        )
+        return _risen(_aligned(animal, heading), smoothed(path[:, 4], 4.0))
+
+
+def _aligned(animal: Actor, heading: Array) -> Actor:
+    """The animal turned about its centre, so that its trunk has the headings (n,) of its path."""
+    trunk = animal.joints[:, -2] - animal.joints[:, 0]
+    turn = np.zeros((len(heading), 3))
+    turn[:, 2] = heading - np.arctan2(trunk[:, 1], trunk[:, 0])
+    rotation, centre = so3.exp(turn), animal.joints.mean(axis=1)
+    moved = SE3(rotation, centre - np.einsum("nij,nj->ni", rotation, centre))
+    return replace(animal, pose=animal.pose.moved(moved))
 
 
 def _risen(animal: Actor, share: Array) -> Actor:
@@ -406,8 +408,20 @@ def film_group(
     Returns:
         The recording with the truth of all animals, and the acts within it.
     """
-    recipe = replace(RECIPES["plain"], n_animals=animals)
-    making = GroupMaking(recipe, seed, n_frames, sensor, family, spine_mm, tuple(encounters), apart)
-    acts = making.group(making._arenas()[0]).acts
-    within = [act._replace(stop=min(act.stop, n_frames)) for act in acts if act.start < n_frames]
-    return making.recording(f"pair-{seed}"), within
+    recipe = RECIPES["plain"]
+    making = Making(recipe, seed, n_frames, sensor, family, spine_mm)
+    rng = np.random.default_rng([seed, 78])
+    base = spine_mm or float(rng.uniform(60.0, 74.0))
+    group = Group(
+        rng, making._arenas()[0], base * (1.0 + apart) ** -np.arange(animals, dtype=float)
+    )
+    while len(group.rows) < n_frames:
+        for action in rng.permutation(encounters):
+            agent, target = rng.permutation(animals)[:2]
+            group.wait(float(rng.uniform(0.5, 1.0)))
+            _play(group, int(agent), int(target), str(action))
+    filmed = _Making(recipe, seed, n_frames, sensor, family, spine_mm, group)
+    within = [
+        act._replace(stop=min(act.stop, n_frames)) for act in group.acts if act.start < n_frames
+    ]
+    return filmed.recording(f"pair-{seed}"), within

@@ -1,0 +1,241 @@
+"""Evaluation of several animals: `liex evaluate several`.
+
+Groups of mice that interact (`simulation.scenes.groups`) are rendered, measured as `liex run` does,
+and the tables scored: identity, errors apart and in contact, abstention, and who did what to whom.
+Conditions alternate: equal lengths or 15 % apart, three makes of cameras, and builds that models
+were trained on or not. The sealed split uses other seeds, which appear in no development.
+"""
+
+import hashlib
+import time
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from liex_lab.behaviour.interactions import Individual, find_interactions
+from liex_lab.errors import LiexError
+from liex_lab.evaluation.scores import MeasuredIndividual, error_of
+from liex_lab.evaluation.several import (
+    SEVERAL_PROTOCOL,
+    Counts,
+    Deed,
+    deed_counts,
+    deed_figures,
+    pose_counts,
+    summed,
+    track_counts,
+    track_figures,
+)
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.simulation.recording import RenderedRecording
+from liex_lab.simulation.scenes.groups import Act, film_group
+from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_SENSOR, unseen
+from liex_lab.tracking.track import spans
+
+from ..build import plan_of
+from .scenes import run_product
+
+Array = NDArray[np.float64]
+
+SEEDS: Final = tuple(range(2001, 2013))
+SEALED_SEEDS: Final = tuple(range(958_204_401, 958_204_413))
+_SENSORS = (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, *unseen((KINECT_V2_SENSOR,)))
+_CONTACT_MM, _ALONE_MM, _ALONE_S = 10.0, 100.0, 1.0  # of `contact` and `isolated`, as printed
+_CAP_MM = 65.0  # of a joint error, about a body length
+
+
+def evaluate_several(
+    animals: int = 2,
+    *,
+    n_frames: int = 1800,
+    n_recordings: int = 6,
+    sealed: bool = False,
+    measure: bool = True,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Measure rendered groups of mice, and score the tables, see `SEVERAL_PROTOCOL`.
+
+    Args:
+        animals: in each recording, 2 to 4.
+        n_frames: length of each recording.
+        n_recordings: of different seeds, 1 to 12.
+        sealed: use the sealed seeds, which are not for development.
+        measure: False only scores the interactions of true joints.
+        progress: called recording by recording.
+
+    Returns:
+        `rows` of results over all recordings and by condition, the seeds and the protocol.
+
+    Raises:
+        LiexError: there are not so many recordings, or animals.
+    """
+    seeds = SEALED_SEEDS if sealed else SEEDS
+    if not (1 <= n_recordings <= len(seeds) and 2 <= animals <= 4):
+        raise LiexError(
+            f"there are 1 to {len(seeds)} recordings of 2 to 4 animals, got {n_recordings} of "
+            f"{animals}"
+        )
+    results: dict[str, list[Counts]] = {}
+    said: list[str] = []
+    for k, seed in enumerate(seeds[:n_recordings]):
+        progress(k, n_recordings, f"measuring group {k + 1}")
+        apart, family = 0.15 * (k % 2), ("train", "other")[k // 2 % 2]
+        recording, acts = film_group(
+            seed, n_frames, animals=animals, apart=apart, sensor=_SENSORS[k % 3], family=family
+        )
+        recording.files.known_digest = hashlib.sha256(
+            f"{recording.name} {animals} {apart} {n_frames}".encode()
+        ).hexdigest()
+        one, sentences = _counts(recording, acts, measure)
+        for name in ("all", "15 % apart" if apart else "equal", f"builds: {family}"):
+            results.setdefault(name, []).append(one)
+        said += [sentence for sentence in sentences if sentence not in said]
+    return {
+        "animals": animals,
+        "rows": {name: _figures(summed(counts)) for name, counts in results.items()},
+        "said": said,
+        "seeds": "sealed" if sealed else list(seeds[:n_recordings]),
+        "n_frames": n_frames,
+        "protocol": SEVERAL_PROTOCOL,
+    }
+
+
+def _counts(
+    recording: RenderedRecording, acts: Sequence[Act], measure: bool
+) -> tuple[Counts, list[str]]:
+    """Counts of one recording, those of interactions under `true` and `measured`, and what the run
+    said.
+    """
+    actors, n = recording.stage.actors, len(recording)
+    time_s = (recording.times_ns - recording.times_ns[0]) * 1e-9
+    gaps = skin_gaps(recording)
+    deeds: list[Deed] = [*acts, *_of_gaps(gaps, time_s)]
+    true = [
+        Individual(str(k), actor.surface.skeleton, actor.joints, actor.present)
+        for k, actor in enumerate(actors)
+    ]
+    found = {f"true {name}": value for name, value in _deeds(true, time_s, deeds).items()}
+    touching = np.asarray(np.nan_to_num(gaps, nan=np.inf) <= _CONTACT_MM)
+    found["contact_s"] = float(touching.sum()) / 2.0 * float(np.median(np.diff(time_s)))
+    if not measure:
+        return found, []
+    began = time.perf_counter()
+    individuals, messages, _ = run_product(recording, plan_of("mouse"))
+    found["seconds"] = time.perf_counter() - began
+    camera = recording.T_arena_camera.inverse()
+    distance = np.full((n, len(actors), len(individuals)), np.nan)
+    for t, actor in enumerate(actors):
+        for k, one in enumerate(individuals):
+            distance[:, t, k] = error_of(one.joints_camera, camera @ actor.joints)
+    trusted = (
+        np.stack([one.trusted for one in individuals], axis=1)
+        if individuals
+        else (np.zeros((n, 0), np.bool_))
+    )
+    resting = np.zeros(n, np.bool_)
+    for act in acts:
+        resting[act.start : act.stop] |= act.action == "huddle"
+    found |= track_counts(distance, time_s)
+    found |= pose_counts(distance, np.asarray(touching.any(axis=2)), trusted, resting, _CAP_MM)
+    if len(individuals) > 1:
+        own = _deeds(_named(individuals, distance, recording), time_s, deeds)
+        found |= {f"measured {name}": value for name, value in own.items()}
+    return found, messages
+
+
+def _named(
+    individuals: Sequence[MeasuredIndividual], distance: Array, recording: RenderedRecording
+) -> list[Individual]:
+    """The individuals under the number of the true animal that each is nearest to in most frames,
+    in the order of these; up to a shift in the arena frame.
+    """
+    cost = np.nan_to_num(np.minimum(distance, _CAP_MM), nan=_CAP_MM).mean(axis=0)
+    taken = cost.argmin(axis=0)
+    return [
+        Individual(
+            str(taken[k]),
+            recording.skeleton,
+            one.joints_camera @ one.R_arena_camera.T,
+            one.trusted,
+        )
+        for k, one in enumerate(individuals)
+    ]
+
+
+def _deeds(animals: Sequence[Individual], time_s: Array, truth: Sequence[Deed]) -> Counts:
+    """Counts of the interactions that are found."""
+    events = find_interactions(time_s, animals).events
+    found = [
+        (int(agent), int(target or -1), word, start, stop)
+        for agent, target, word, start, stop in events[
+            ["agent", "target", "action", "start_frame", "stop_frame"]
+        ].itertuples(index=False, name=None)
+    ]
+    return deed_counts(truth, found, len(time_s))
+
+
+def skin_gaps(recording: RenderedRecording) -> Array:
+    """(n, A, A) distance of the rendered trunks' vertices of two animals, mm; NaN of one alone."""
+    actors, n = recording.stage.actors, len(recording)
+    gaps = np.full((n, len(actors), len(actors)), np.nan)
+    for start in range(0, n, 256):
+        rows = slice(start, start + 256)
+        skins = [
+            actor[rows].solids[0].vertices()[:, : actor.surface.n_trunk_vertices]
+            for actor in actors
+        ]
+        for i in range(len(skins[0])):
+            trees = [cKDTree(skin[i]) for skin in skins]
+            for a, tree in enumerate(trees):
+                for b in range(a):
+                    gap = float(tree.query(skins[b][i])[0].min())
+                    gaps[start + i, [a, b], [b, a]] = gap
+    return gaps
+
+
+def _of_gaps(gaps: Array, time_s: Array) -> list[Deed]:
+    """True contact and isolation, by the distances of the skins."""
+    nearest = np.nanmin(gaps, axis=2)
+    found: list[Deed] = []
+    for a in range(gaps.shape[1]):
+        found += [
+            (a, -1, "isolated", start, stop)
+            for start, stop in spans(nearest[:, a] > _ALONE_MM)
+            if time_s[stop - 1] - time_s[start] >= _ALONE_S
+        ]
+        for b in range(a):
+            found += [(a, b, "contact", *span) for span in spans(gaps[:, a, b] <= _CONTACT_MM)]
+    return found
+
+
+def _figures(counts: Counts) -> dict[str, Any]:
+    """One row of results."""
+
+    def ratio(of: str, per: str) -> float | None:
+        return counts[of] / counts[per] if counts.get(per) else None
+
+    figures: dict[str, Any] = {}
+    hours = counts["contact_s"] / 3600.0
+    if "n_frames" in counts:
+        figures = {
+            "swaps": int(counts["swaps"]),
+            "swaps_per_contact_hour": counts["swaps"] / hours if hours else None,
+            **track_figures(counts),
+            "joint_error_apart_mm": ratio("apart_mm", "n_apart"),
+            "joint_error_contact_mm": ratio("contact_mm", "n_contact"),
+            "abstained": ratio("abstained", "n_asked"),
+            "swap_calibration": None,
+            "frames_per_s": ratio("n_frames", "seconds"),
+        }
+    figures["contact_s"] = counts["contact_s"]
+    for kind in ("true", "measured"):
+        own = {
+            name.removeprefix(f"{kind} "): value
+            for name, value in counts.items()
+            if name.startswith(f"{kind} ")
+        }
+        figures[f"interactions_{kind}"] = deed_figures(own) if own else None
+    return figures
