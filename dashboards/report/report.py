@@ -213,7 +213,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 _TABLES = (
     *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
-    *("summary", "transitions", "activity", "zones"),
+    *("summary", "transitions", "activity", "zones", "interactions", "interaction_totals"),
 )
 
 
@@ -288,10 +288,34 @@ def render(session: Session, figures: Path | None = None) -> str:
         beside_average=beside_average,
         gaps=gaps.nlargest(12, "n_frames_missing").sort_values("start_s").to_dict("records"),
         refused=refusal_rows(session),
+        interactions=interaction_rows(session),
         no_actions=about.get("no_actions", ""),
         methods=methods(session),
         glossary=glossary(session),
     )
+
+
+def interaction_rows(session: Session) -> dict[str, list[str]]:
+    """Share and number of each interaction by pair: the pairs under '', then a row per action.
+
+    `isolated` stands under every pair of its animal. Empty for a session of one animal.
+    """
+    if not session.has("interaction_totals.parquet"):
+        return {}
+    table = session.interaction_totals
+    totals = {
+        (agent, target, action): f"{share:.1%} ({count})" if count else "–"
+        for agent, target, action, share, count in table[
+            ["agent", "target", "action", "share", "count"]
+        ].itertuples(index=False, name=None)
+    }
+    pairs = list(dict.fromkeys(key[:2] for key in totals if key[1]))
+    rows = {"": [f"{agent} → {target}" for agent, target in pairs]}
+    for action in table["action"].unique():
+        rows[action] = [
+            totals.get((*pair, action)) or totals[pair[0], "", action] for pair in pairs
+        ]
+    return rows
 
 
 def clip_links(session: Session) -> dict[str, str]:
