@@ -103,6 +103,7 @@ CHANGED = {
         "--action rear_supported": "--action walk",
     },
     "docs/howto/sync.md": {"liex sync": f"{PULSES}liex sync"},
+    "docs/howto/interactions.md": {"several.json": "several.json --frames 300 --recordings 1"},
     "docs/tutorials/study.md": {
         "frames=90": "frames=40",
         "liex cohort study/study.toml --dry-run": f"{GROUPS}liex cohort study/study.toml --dry-run",

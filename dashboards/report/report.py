@@ -214,6 +214,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = (
     *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
     *("summary", "transitions", "activity", "zones", "events"),
+    *("interactions", "interaction_totals"),
 )
 
 
@@ -288,6 +289,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         beside_average=beside_average,
         gaps=gaps.nlargest(12, "n_frames_missing").sort_values("start_s").to_dict("records"),
         refused=refusal_rows(session),
+        interactions=interaction_rows(session),
         no_actions=about.get("no_actions", ""),
         methods=methods(session),
         glossary=glossary(session),
@@ -298,6 +300,29 @@ def _unmeasured(about: Mapping[str, Any]) -> int:
     """How many animals are in view and not measured, by the content of session.json."""
     found = about.get("verdict") or {}
     return max(0, int(found.get("n_animals", 1)) - int(found.get("n_measured", 1)))
+
+
+def interaction_rows(session: Session) -> dict[str, list[str]]:
+    """Share and number of each interaction by pair: the pairs under '', then a row per action.
+
+    `isolated` stands under every pair of its animal. Empty for a session of one animal.
+    """
+    if not session.has("interaction_totals.parquet"):
+        return {}
+    table = session.interaction_totals
+    totals = {
+        (agent, target, action): f"{share:.1%} ({count})" if count else "–"
+        for agent, target, action, share, count in table[
+            ["agent", "target", "action", "share", "count"]
+        ].itertuples(index=False, name=None)
+    }
+    pairs = list(dict.fromkeys(key[:2] for key in totals if key[1]))
+    rows = {"": [f"{agent} → {target}" for agent, target in pairs]}
+    for action in table["action"].unique():
+        rows[action] = [
+            totals.get((*pair, action)) or totals[pair[0], "", action] for pair in pairs
+        ]
+    return rows
 
 
 def clip_links(session: Session) -> dict[str, str]:

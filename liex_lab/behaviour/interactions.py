@@ -1,4 +1,5 @@
-"""Who did what to whom: interactions of two to four animals of one arena, from their 3D joints.
+"""Interactions of two to four animals of one arena, from their 3D joints: which one did what to
+which other.
 
 The words are `actions.vocabulary.INTERACTIONS`, their limits the plan's section `interactions`. A
 rule is the least of relative margins, 1 - d / D of a distance d within D and v / V - 1 of a speed v
@@ -329,12 +330,12 @@ class _Arena:
         """Every interaction; pair by pair, not in order of time."""
         for i, j in combinations(range(len(self.animals)), 2):
             yield from self._of_pair(i, j)
-        seen = self.observed()
-        number = segments(self.time_s, seen)
+        observed = self.observed()
+        number = segments(self.time_s, observed)
         for i in range(len(self.animals)):
             nearest = np.min([one.gap for (a, _), one in self.relations.items() if a == i], axis=0)
             margin = _over(nearest, self.limits.isolated_mm)
-            for start, stop, score in self._spans("isolated", margin, seen, number):
+            for start, stop, score in self._spans("isolated", margin, observed, number):
                 yield _Event(i, -1, "isolated", start, stop, score, True)
 
     def _spans(
@@ -349,19 +350,19 @@ class _Arena:
 
     def _of_pair(self, i: int, j: int) -> Iterator[_Event]:
         """The interactions of two animals."""
-        seen = self.observed(i, j)
-        number = segments(self.time_s, seen)
+        observed = self.observed(i, j)
+        number = segments(self.time_s, observed)
         ways = ((i, j), (j, i))
         margins = {way: self._margins(*way, number) for way in ways}
-        free = {way: seen.copy() for way in ways}
-        done = {word: np.zeros(len(seen), np.bool_) for word in WORDS}  # by either animal
+        free = {way: observed.copy() for way in ways}
+        done = {word: np.zeros(len(observed), np.bool_) for word in WORDS}  # by either animal
         for word in (word for word in WORDS if word in margins[ways[0]]):
             rule = WORDS[word]
             without = np.any([done[one] for one in rule.not_in], axis=0)
             for way in ways[:1] if rule.mutual else ways:
                 taken = ways if rule.mutual else (way,)
                 room = np.all([free[one] for one in taken], axis=0)
-                room = seen & ~without if rule.layered else room
+                room = observed & ~without if rule.layered else room
                 for start, stop, score in self._spans(word, margins[way][word], room, number):
                     rows = slice(start, stop)
                     done[word][rows] = True
@@ -513,9 +514,9 @@ def _totals(arena: _Arena, found: Sequence[_Event], names: Sequence[str]) -> pd.
     rows = []
     pairs = [*permutations(range(len(names)), 2), *((i, -1) for i in range(len(names)))]
     for agent, target in pairs:
-        seen = arena.observed() if target < 0 else arena.observed(agent, target)
-        observed_s = float(hold[seen].sum())
-        first_s = float(arena.time_s[seen][0]) if seen.any() else np.nan
+        observed = arena.observed() if target < 0 else arena.observed(agent, target)
+        observed_s = float(hold[observed].sum())
+        first_s = float(arena.time_s[observed][0]) if observed.any() else np.nan
         for word, one in WORDS.items():
             if (word == "isolated") != (target < 0) or (swims and word in _WALKERS):
                 continue

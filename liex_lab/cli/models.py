@@ -506,7 +506,7 @@ def evaluate_several(
     *,
     progress: Progress,
 ) -> Result:
-    """Measure rendered groups of mice: identity, errors in contact, who did what to whom."""
+    """Measure rendered groups of mice: identity, errors in contact, and interactions."""
     return api.evaluate_several(
         animals,
         n_frames=n_frames,

@@ -1,4 +1,4 @@
-"""Scores of several animals against truth: identity, poses, and who did what to whom.
+"""Scores of several animals against truth: identity, poses and interactions.
 
 Similarity of a measured and a true animal in a frame is s = 1 - d / 30 mm, at least 0, of their
 mean joint distance d; a match at threshold a has s >= a, so that 0.5 is 15 mm. HOTA is the mean of

@@ -229,9 +229,7 @@ class Session:
 
     interactions = _table(
         "interactions",
-        """Table `interactions`: who did what to whom, one row per event.
-
-    It lists those of all animals of the arena.
+        """Table `interactions`, one row per event of any two animals of the arena.
 
     Only sessions of several animals in one arena have it.
     """,

@@ -1,7 +1,7 @@
 """Evaluation of several animals: `liex evaluate several`.
 
 Groups of mice that interact (`simulation.scenes.groups`) are rendered, measured as `liex run` does,
-and the tables scored: identity, errors apart and in contact, abstention, and who did what to whom.
+and the tables scored: identity, errors apart and in contact, abstention and interactions.
 Conditions alternate: equal lengths or 15 % apart, three makes of cameras, and builds that models
 were trained on or not. The sealed split uses other seeds, which appear in no development.
 """
@@ -79,7 +79,7 @@ def evaluate_several(
             f"{animals}"
         )
     results: dict[str, list[Counts]] = {}
-    said: list[str] = []
+    messages: list[str] = []
     for k, seed in enumerate(seeds[:n_recordings]):
         progress(k, n_recordings, f"measuring group {k + 1}")
         apart, family = 0.15 * (k % 2), ("train", "other")[k // 2 % 2]
@@ -92,11 +92,11 @@ def evaluate_several(
         one, sentences = _counts(recording, acts, measure)
         for name in ("all", "15 % apart" if apart else "equal", f"builds: {family}"):
             results.setdefault(name, []).append(one)
-        said += [sentence for sentence in sentences if sentence not in said]
+        messages += [sentence for sentence in sentences if sentence not in messages]
     return {
         "animals": animals,
         "rows": {name: _figures(summed(counts)) for name, counts in results.items()},
-        "said": said,
+        "said": messages,
         "seeds": "sealed" if sealed else list(seeds[:n_recordings]),
         "n_frames": n_frames,
         "protocol": SEVERAL_PROTOCOL,
@@ -106,8 +106,8 @@ def evaluate_several(
 def _counts(
     recording: RenderedRecording, acts: Sequence[Act], measure: bool
 ) -> tuple[Counts, list[str]]:
-    """Counts of one recording, those of interactions under `true` and `measured`, and what the run
-    said.
+    """Counts of one recording, those of interactions under `true` and `measured`, and the messages
+    of the run.
     """
     actors, n = recording.stage.actors, len(recording)
     time_s = (recording.times_ns - recording.times_ns[0]) * 1e-9

@@ -167,7 +167,10 @@ def test_several_animals_of_a_file_become_sessions_with_their_interactions(tmp_p
     file = several(tmp_path, behind)
     with pytest.raises(LiexError, match="holds the animals ada, bob; choose one"):
         import_points(file, "mouse", tmp_path)
-    folders = import_animals(file, "mouse", tmp_path, report=False)
+    folders = import_animals(file, "mouse", tmp_path)
+    page = (folders[1] / "report.html").read_text()
+    assert "ada → bob" in page
+    assert "interaction_totals.parquet" in page
     assert [one.name for one in folders] == ["pair-ada.liex", "pair-bob.liex"]
     ada, bob = map(Session.open, folders)
     assert [ada.metadata["individual"], bob.metadata["individual"]] == ["ada", "bob"]

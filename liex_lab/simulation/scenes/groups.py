@@ -1,4 +1,4 @@
-"""Groups of mice that interact, with the truth of who did what to whom: `synthetic:pair`.
+"""Groups of mice that interact, with the truth of their interactions: `synthetic:pair`.
 
 A group plays encounters in turn: one animal walks up to another, does one of `ENCOUNTERS`, and one
 of the two leaves. Each animal steers towards goals in the floor, around the others; its body and
@@ -79,11 +79,11 @@ class Group:
         self.resting, self.mounting = np.zeros((2, len(spines)))
 
     def _spot(
-        self, who: int, apart_mm: float = 130.0, middle: Array | None = None, far_mm: float = 0.0
+        self, mover: int, apart_mm: float = 130.0, middle: Array | None = None, far_mm: float = 0.0
     ) -> Array:
         """A free place, away from all other animals and `far_mm` from a point, or the best."""
-        others = self.at[np.arange(len(self.at)) != who]
-        spots = [free_spot(self.rng, self.arena, 0.8 * float(self.spine[who])) for _ in range(24)]
+        others = self.at[np.arange(len(self.at)) != mover]
+        spots = [free_spot(self.rng, self.arena, 0.8 * float(self.spine[mover])) for _ in range(24)]
         room = [np.linalg.norm(others - spot, axis=1).min() / apart_mm for spot in spots]
         if middle is not None:
             far = [float(np.linalg.norm(spot - middle)) / far_mm for spot in spots]
@@ -91,37 +91,37 @@ class Group:
         good = np.array(room) > 1.0
         return spots[int(np.argmax(good if good.any() else room))]
 
-    def ahead(self, who: int) -> Array:
+    def ahead(self, mover: int) -> Array:
         """Unit vector of an animal's heading."""
-        return np.array([np.cos(self.way[who]), np.sin(self.way[who])])
+        return np.array([np.cos(self.way[mover]), np.sin(self.way[mover])])
 
     def frame(self) -> None:
         """Keep the present frame."""
         state = (self.at, self.way, self.resting, self.mounting)
         self.rows.append(np.column_stack(state))
 
-    def step(self, who: int, goal: Array, mm_s: float, shy: Sequence[int] = ()) -> float:
+    def step(self, mover: int, goal: Array, mm_s: float, shy: Sequence[int] = ()) -> float:
         """Walk one frame towards a goal, around the animals of `shy`; returns the distance left."""
-        gap = goal - self.at[who]
+        gap = goal - self.at[mover]
         left = float(np.linalg.norm(gap))
         ahead = float(np.arctan2(gap[1], gap[0]))
         for other in shy:
-            toward = self.at[other] - self.at[who]
+            toward = self.at[other] - self.at[mover]
             far = float(np.linalg.norm(toward))
             off = (ahead - np.arctan2(toward[1], toward[0]) + np.pi) % (2 * np.pi) - np.pi
             clear = np.arcsin(min(1.0, _ROOM_MM / max(far, 1.0)))
             clear += max(0.0, 1.0 - far / _ROOM_MM)  # outwards, if it is too near
             if far < left + 40.0 and abs(off) < clear:
                 ahead += (np.sign(off) or 1.0) * (clear - abs(off))
-        turn = (ahead - self.way[who] + np.pi) % (2 * np.pi) - np.pi
-        self.way[who] += np.clip(turn, -_TURN, _TURN)
+        turn = (ahead - self.way[mover] + np.pi) % (2 * np.pi) - np.pi
+        self.way[mover] += np.clip(turn, -_TURN, _TURN)
         run = min(mm_s, 8.0 * left + 20.0) * max(float(np.cos(turn)), 0.1) / _HZ
-        self.at[who] += min(run, left) * self.ahead(who)
+        self.at[mover] += min(run, left) * self.ahead(mover)
         return left
 
     def walk(
         self,
-        who: int,
+        mover: int,
         goal: Array,
         mm_s: float,
         shy: Sequence[int] = (),
@@ -129,18 +129,18 @@ class Group:
     ) -> None:
         """Walk to a goal, at most 6 s."""
         for _ in range(180):
-            left = self.step(who, goal, mm_s, shy)
+            left = self.step(mover, goal, mm_s, shy)
             self.frame()
             if left < near_mm:
                 return
 
-    def face(self, who: int, way: float) -> None:
+    def face(self, mover: int, way: float) -> None:
         """Turn in place."""
         for _ in range(40):
-            turn = (way - self.way[who] + np.pi) % (2 * np.pi) - np.pi
+            turn = (way - self.way[mover] + np.pi) % (2 * np.pi) - np.pi
             if abs(turn) < 0.03:
                 return
-            self.way[who] += np.clip(turn, -_TURN, _TURN)
+            self.way[mover] += np.clip(turn, -_TURN, _TURN)
             self.frame()
 
     def wait(self, seconds: float) -> None:
@@ -216,9 +216,9 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
             aside = np.array([-way[1], way[0]]) / np.linalg.norm(way) * rng.uniform(22.0, 40.0)
             goals, shy = [group.at[target] + aside, group.at[agent] - aside], ([], [])
         for _ in range(int(3.0 * _HZ)):
-            for k, who in enumerate((agent, target)):
-                if np.linalg.norm(goals[k] - group.at[who]) > 12.0:
-                    group.step(who, goals[k], 170.0, shy[k])
+            for k, mover in enumerate((agent, target)):
+                if np.linalg.norm(goals[k] - group.at[mover]) > 12.0:
+                    group.step(mover, goals[k], 170.0, shy[k])
             group.frame()
         return
     if action in ("follow", "chase"):
