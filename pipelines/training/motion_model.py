@@ -362,7 +362,7 @@ def _errors(each: Measured, track: Track) -> tuple[NDArray[np.bool_], Array]:
 
 
 def _weight_of(kinds: Sequence[str]) -> Array:
-    """Weights (n,) of things of n kinds, with the same sum for each kind."""
+    """Weights (n,), the same sum for each of the kinds (n,)."""
     _, kind, count = np.unique(kinds, return_inverse=True, return_counts=True)
     return np.asarray(1.0 / count[kind])
 
