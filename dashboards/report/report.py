@@ -214,7 +214,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = (
     *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
     *("summary", "transitions", "activity", "zones", "events"),
-    *("interactions", "interaction_totals"),
+    *("crossings", "interactions", "interaction_totals"),
 )
 
 

@@ -68,10 +68,11 @@ class Results:
             "flips": [rows.flips(self.flips)],
             "sessions": [self.session_row()],
         }
-        if self.crossings is not None:
-            own["crossings"] = [rows.crossings(self.crossings)]
         for name, blocks in own.items():
             tables.write_table(folder / f"{name}.parquet", tables.TABLES[name], blocks, described)
+        if self.crossings is not None:
+            met = [rows.crossings(self.crossings)]
+            tables.write_table(folder / "crossings.parquet", tables.CROSSINGS, met, described)
 
     def write_measured(
         self, folder: Path, results: Mapping[str, pd.DataFrame], columns: Sequence[tables.Column]
@@ -98,7 +99,8 @@ class Results:
                 tables.write_table(
                     folder / f"{name}.parquet", schema, tables.from_pandas(result), described
                 )
-        text = json.dumps(tables.dictionary(columns), indent=1, ensure_ascii=False)
+        met = () if self.crossings is None else tables.CROSSINGS
+        text = json.dumps(tables.dictionary(columns, met), indent=1, ensure_ascii=False)
         (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
 
     def session_row(self) -> dict[str, Any]:

@@ -136,14 +136,15 @@ class Vocabulary:
 BEHAVIOUR = ("kinematics", "bouts", "summary", "transitions", "zones", "activity")
 TABLES: dict[str, tuple[Column, ...]] = {
     name: table_columns(name)
-    for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "crossings", "sessions")
+    for name in ("frames", "poses", "rotations", "bouts", "gaps", "flips", "sessions")
 }
-FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, CROSSINGS, SESSIONS = TABLES.values()
+FRAMES, POSES, ROTATIONS, BOUTS, GAPS, FLIPS, SESSIONS = TABLES.values()
 SYNCED = {  # on the clock of another instrument, see `sessions.clock`; by table
     name: tuple(_column(line, {}) for line in _listed()[name] if line["when"] == "synced")
     for name in ("frames", "bouts")
 }
 # of sessions with several animals in one arena only
+CROSSINGS = table_columns("crossings")
 INTERACTIONS = table_columns("interactions") + table_columns("interaction_totals")
 EVENTS = table_columns("events")  # of another instrument
 POINTS = table_columns("points")  # of an export; no session contains it
@@ -157,7 +158,7 @@ def all_columns() -> dict[str, Column]:
         Vocabulary(tuple(WORDS.get(animal, ())), (), kind).columns
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
-    tables = chain(*TABLES.values(), *SYNCED.values(), INTERACTIONS, EVENTS, POINTS)
+    tables = chain(*TABLES.values(), *SYNCED.values(), CROSSINGS, INTERACTIONS, EVENTS, POINTS)
     every = chain(tables, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 

@@ -66,7 +66,7 @@ def test_every_verb_explains_itself(words: list[str]) -> None:
 
 IMPERATIVES = {
     *("Apply", "Check", "Compare", "Convert", "Correct", "Draw", "Edit", "Exchange", "Export"),
-    *("List", "Make", "Measure", "Move", "Open", "Pack", "Redo", "Regenerate", "Report"),
+    *("List", "Make", "Measure", "Move", "Open", "Pack", "Put", "Redo", "Regenerate", "Report"),
     *("Score", "Set", "Show", "Train", "Undo", "Write"),
 }
 
