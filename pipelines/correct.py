@@ -32,6 +32,7 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, correcting, corrections, evidence, rrd
 from liex_lab.sessions.clock import fingerprint
 from liex_lab.sessions.folder import file_facts
+from liex_lab.sessions.provenance import reading_from
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, frame_count
 from liex_lab.tracking import curve, observations, smoother
@@ -214,7 +215,8 @@ def _synchronise(raw: Session, log: corrections.Log, folder: Path) -> correction
 
     for name, compute in (("frames.parquet", on_frames), ("bouts.parquet", on_bouts)):
         part = folder / f"{name}.part"
-        schema.append_columns(latest(name), part, schema.SYNCED[Path(name).stem], compute)
+        with reading_from(latest(name)) as path:
+            schema.append_columns(path, part, schema.SYNCED[Path(name).stem], compute)
         part.replace(folder / name)
     more = [column for added in schema.SYNCED.values() for column in added]
     if clock.events:
@@ -228,8 +230,8 @@ def _synchronise(raw: Session, log: corrections.Log, folder: Path) -> correction
         }
         schema.write_table(folder / "events.parquet", schema.EVENTS, [rows], {})
         more += schema.EVENTS
-    columns = json.loads(latest("columns.json").read_text(encoding="utf-8"))
-    columns += [asdict(column) for column in more]
+    with reading_from(latest("columns.json")) as path:
+        columns = [*json.loads(path.read_text(encoding="utf-8")), *map(asdict, more)]
     text = json.dumps(columns, indent=1, ensure_ascii=False)
     (folder / "columns.json").write_text(text + "\n", encoding="utf-8")
     return replace(log, facts={**log.facts, "sync": clock.facts()})

@@ -289,6 +289,9 @@ def sync(
     ours, others = fit.n_unmatched
     echo(f"synced:    {fit}")
     echo(f"alone:     {ours} events of the session and {others} of {fit.name}")
+    sd_ms = _opened(session).table("frames", ["sync_sd_ms"])["sync_sd_ms"]
+    error = f"{sd_ms.median():.3f} ms in the median, {sd_ms.max():.3f} ms at most"
+    echo(f"error:     {'unknown, of two pairs' if fit.sd_s is None else error}")
     echo(f"tables:    {session / 'corrected'} (frames sync_s; bouts sync_start_s and sync_stop_s)")
     echo(f"report:    {session / 'report.html'}")
 

@@ -248,8 +248,8 @@ def append_columns(
         compute: called with the columns of some rows; returns the new ones.
     """
     with pq.ParquetFile(path) as file:
-        described = json.loads(file.schema_arrow.metadata[b"liex_lab"])
-        described["columns"] |= {column.name: asdict(column) for column in columns}
+        described = json.loads((file.schema_arrow.metadata or {}).get(b"liex_lab", b"{}"))
+        described.setdefault("columns", {}).update({one.name: asdict(one) for one in columns})
         fields = [*file.schema_arrow, *arrow_schema(columns, {})]
         arrow = pa.schema(fields, {"liex_lab": json.dumps(described, sort_keys=True)})
         texts = [field.name for field in fields if field.type == pa.string()]
