@@ -41,7 +41,7 @@ SEVERAL_PROTOCOL = (
     "of the distance to the nearest true animal by assignment, capped at 65 mm, where that animal "
     "touches no other, and where it does. found: share of animals and frames matched within 15 mm. "
     "abstained: share of animals and frames without a trusted pose, apart from huddles. "
-    "crossings: stretches in which the tables say that animals may have been exchanged, "
+    "crossings: stretches in which animals may have been exchanged, by the tables, "
     "unsaid_swaps: those of a probability below 0.1 in which they were. swap_calibration: mean "
     "over crossings of the difference between stated and true share of exchanges, in bins of "
     "probability from 0, 0.1 and 0.3 on. frames_per_s: of the whole run. Interactions, f1: of "
