@@ -40,6 +40,8 @@ from liex_lab.tracking.track import CORRECTED, Flip, Track, ends_of
 
 from .session import measure_behaviour
 
+_BEFORE = "The tables of interactions are those of the poses before their correction."
+
 Numbers = NDArray[np.int64]  # of rows
 
 
@@ -160,15 +162,18 @@ def _apply(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
     results = evidence.Results(origin, rows, found.flips)
     behaviour, facts = _behaviour(raw, log, found, results)
     written = behaviour.tables
+    together = schema.INTERACTIONS if raw.has("interactions.parquet") else ()
     if len(found.turned) or len(found.moved):
         results.write_track(folder)
         facts["frames"] = results.counts()
+        if together:
+            facts["problems"] = [*raw.metadata["problems"], _BEFORE]
     else:
         # tables that bout edits do not change
         written = {
             name: table for name, table in written.items() if name not in ("kinematics", "zones")
         }
-    results.write_measured(folder, written, behaviour.vocabulary.columns)
+    results.write_measured(folder, written, (*behaviour.vocabulary.columns, *together))
     facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}
     layout = replay_blueprint({**raw.metadata, **facts})
     rrd.ReplayWriter(folder / corrections.REPLAY, origin, layout, corrected=True).finish(

@@ -303,7 +303,8 @@ INTERACTIONS: dict[str, Interaction] = {
         "sniffgenital",
     ),
     "nose_to_side": Interaction(
-        "the agent's nose is within {contact_mm:g} mm of the skin of the target's trunk",
+        "the agent's nose is within {contact_mm:g} mm of the skin of the target's trunk, nearest "
+        "to its middle half",
         "sniffbody",
     ),
     "side_by_side_same": Interaction(

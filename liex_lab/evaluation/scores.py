@@ -351,6 +351,8 @@ class MeasuredIndividual:
         sd_mm: (n, J, 3) standard deviations along x, y and z of the arena, mm.
         expected_mm: (n,) predicted error, mm.
         R_arena_camera: (3, 3) from the axes of `joints_camera` to the arena's.
+        crossings: (k, 3) first frame, frame after the last, and probability of an exchange, of the
+            stretches in which it may have been exchanged with another one.
     """
 
     joints_camera: Array
@@ -358,6 +360,7 @@ class MeasuredIndividual:
     sd_mm: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
     expected_mm: Array = field(default_factory=lambda: np.zeros(0))
     R_arena_camera: Array = field(default_factory=lambda: np.eye(3))
+    crossings: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 class Tally:

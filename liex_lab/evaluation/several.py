@@ -28,6 +28,7 @@ Deed = tuple[int, int, str, int, int]  # agent, target (-1: none), action, start
 _ZERO_MM = 30.0  # distance of similarity 0
 _ALPHAS = np.arange(0.05, 0.99, 0.05)
 _HALF = 0.5 - 1e-9
+_BINS = (0.0, 0.1, 0.3)  # of stated probabilities, from each on
 _SWAP_S = 0.5  # changes of several individuals within this time are one swap
 SEVERAL_PROTOCOL = (
     "Rendered mice that interact, each recording measured as `liex run` does and its tables read "
@@ -40,8 +41,11 @@ SEVERAL_PROTOCOL = (
     "of the distance to the nearest true animal by assignment, capped at 65 mm, where that animal "
     "touches no other, and where it does. found: share of animals and frames matched within 15 mm. "
     "abstained: share of animals and frames without a trusted pose, apart from huddles. "
-    "swap_calibration: null, as no session states the probability of a swap. frames_per_s: of the "
-    "whole run. Interactions, f1: of frames and ordered pairs, the harmonic mean of precision and "
+    "crossings: stretches in which animals may have been exchanged, by the tables, "
+    "unsaid_swaps: those of a probability below 0.1 in which they were. swap_calibration: mean "
+    "over crossings of the difference between stated and true share of exchanges, in bins of "
+    "probability from 0, 0.1 and 0.3 on. frames_per_s: of the whole run. Interactions, f1: of "
+    "frames and ordered pairs, the harmonic mean of precision and "
     "recall of each action, and their mean (macro_f1) over the actions that happened. Truth is the "
     "script of the animals; of contact and isolated the distances of the rendered skins. "
     "direction: of the frames in which an action is found for the right pair, or for the same pair "
@@ -109,6 +113,43 @@ def track_figures(counts: Mapping[str, float]) -> dict[str, float | None]:
         "idf1": 2.0 * counts["idtp"] / both if both else None,
         "hota": float(np.mean(hota)),
         "found": counts[f"tp{half}"] / counts["n_true"] if counts["n_true"] else None,
+    }
+
+
+def crossing_counts(distance_mm: Array, crossings: Array) -> Counts:
+    """Counts of crossings and of true exchanges in them, of one recording.
+
+    Args:
+        distance_mm: (n, T, K), see `track_counts`.
+        crossings: (k, 3) first frame, frame after the last, stated probability of an exchange.
+    """
+    found = summed([])
+    near = np.nan_to_num(distance_mm, nan=np.inf) <= _ZERO_MM / 2.0
+    on = np.where(near.any(axis=1), near.argmax(axis=1), -1)  # (n, K) the true animal
+    for start, stop, p in crossings:
+        before, after = (
+            [next((t for t in row if t >= 0), -1) for row in part.T]
+            for part in (on[: int(start)][::-1], on[int(stop) :])
+        )
+        known = [(a, b) for a, b in zip(before, after, strict=True) if min(a, b) >= 0]
+        if known:
+            exchanged = any(a != b for a, b in known)
+            k = int(np.searchsorted(_BINS, p, side="right"))
+            found["crossings"] += 1
+            found[f"p{k}"] += float(p)
+            found[f"exchanged{k}"] += exchanged
+    return found
+
+
+def crossing_figures(counts: Mapping[str, float]) -> dict[str, float | None]:
+    """Calibration of the probability of exchanges, of summed `crossing_counts`."""
+    n = counts.get("crossings", 0.0)
+    bins = range(1, len(_BINS) + 1)
+    off = sum(abs(counts.get(f"p{k}", 0.0) - counts.get(f"exchanged{k}", 0.0)) for k in bins)
+    return {
+        "crossings": int(n),
+        "unsaid_swaps": int(counts.get("exchanged1", 0.0)),
+        "swap_calibration": off / n if n else None,
     }
 
 

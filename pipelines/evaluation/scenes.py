@@ -145,8 +145,9 @@ def run_product(
     with tempfile.TemporaryDirectory(prefix="liex-scenes-") as folder:
         try:
             arenas = propose_arenas(recording, quick)
-            if arenas:  # each is a session
+            if arenas:
                 quick = quick.model_copy(update={"arenas": arenas})
+            if arenas or quick.animal.count != 1:  # each is a session
                 outcomes = run_arenas(recording, quick, folder, report=False)
                 refused = [one.error for one in outcomes if one.error is not None]
             else:
@@ -172,6 +173,10 @@ def read_individuals(session: Session) -> list[MeasuredIndividual]:
     mirrored = bool((session.metadata["camera"].get("optics") or {}).get("mirrored"))
     side = np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
     n_joints = len(session.poses["joint"].unique())
+    crossings = np.zeros((0, 3))
+    if session.has("crossings.parquet"):
+        names = ["start_frame", "stop_frame", "p_swap"]
+        crossings = session.table("crossings", names).to_numpy(float)
     found = []
     for name, frames in session.frames.groupby("individual", sort=True):
         poses = session.poses[session.poses["individual"] == name]
@@ -187,6 +192,7 @@ def read_individuals(session: Session) -> list[MeasuredIndividual]:
                 sd_mm,
                 frames["predicted_error_mm"].to_numpy(float),
                 T_arena_camera.rotation * side,
+                crossings,
             )
         )
     return found

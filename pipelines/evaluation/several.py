@@ -22,6 +22,8 @@ from liex_lab.evaluation.several import (
     SEVERAL_PROTOCOL,
     Counts,
     Deed,
+    crossing_counts,
+    crossing_figures,
     deed_counts,
     deed_figures,
     pose_counts,
@@ -123,7 +125,8 @@ def _counts(
     if not measure:
         return found, []
     began = time.perf_counter()
-    individuals, messages, _ = run_product(recording, plan_of("mouse"))
+    plan = plan_of("mouse").with_settings([f"animal.count={len(actors)}"])
+    individuals, messages, _ = run_product(recording, plan)
     found["seconds"] = time.perf_counter() - began
     camera = recording.T_arena_camera.inverse()
     distance = np.full((n, len(actors), len(individuals)), np.nan)
@@ -139,6 +142,8 @@ def _counts(
     for act in acts:
         resting[act.start : act.stop] |= act.action == "huddle"
     found |= track_counts(distance, time_s)
+    crossings = np.concatenate([np.zeros((0, 3)), *(one.crossings for one in individuals)])
+    found |= crossing_counts(distance, np.unique(crossings, axis=0))
     found |= pose_counts(distance, np.asarray(touching.any(axis=2)), trusted, resting, _CAP_MM)
     if len(individuals) > 1:
         own = _deeds(_named(individuals, distance, recording), time_s, deeds)
@@ -227,7 +232,7 @@ def _figures(counts: Counts) -> dict[str, Any]:
             "joint_error_apart_mm": ratio("apart_mm", "n_apart"),
             "joint_error_contact_mm": ratio("contact_mm", "n_contact"),
             "abstained": ratio("abstained", "n_asked"),
-            "swap_calibration": None,
+            **crossing_figures(counts),
             "frames_per_s": ratio("n_frames", "seconds"),
         }
     figures["contact_s"] = counts["contact_s"]

@@ -229,6 +229,14 @@ CALLS: list[tuple[str, str, Any, tuple[Any, ...], dict[str, Any], str]] = [
         "| plain | 0.988 | – | look here; and here |",
     ),
     (
+        "evaluate several --animals 3 --frames 300",
+        "evaluation.several.evaluate_several",
+        {"rows": {"all": {"idf1": 0.5, "interactions_true": {"macro_f1": 0.9, "f1": {}}}}},
+        (3,),
+        {"n_frames": 300, "n_recordings": 6, "sealed": False, "measure": True},
+        "| all | 0.5 | 0.9 |",
+    ),
+    (
         "evaluate speed",
         "evaluation.speed.evaluate_speed",
         {"stages_ms": {"foreground": 0.1}},

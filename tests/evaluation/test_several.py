@@ -73,6 +73,19 @@ def test_a_track_that_goes_over_to_another_animal_is_a_swap():
     assert (nothing["idf1"], nothing["hota"]) == (0.0, 0.0)
 
 
+def test_crossings_are_calibrated_against_the_exchanges_in_them():
+    distance = np.where(np.eye(2, dtype=bool), 2.0, 200.0)[None].repeat(90, axis=0)
+    distance[25:35] = np.nan
+    distance[60:] = distance[60:, ::-1]
+    crossings = np.array([[25.0, 35.0, 0.02], [58.0, 62.0, 0.6], [80.0, 82.0, 0.05]])
+    found = several.crossing_figures(several.crossing_counts(distance, crossings))
+    assert (found["crossings"], found["unsaid_swaps"]) == (3, 0)
+    assert found["swap_calibration"] == pytest.approx((0.07 + 0.4) / 3)
+    sure = several.crossing_figures(several.crossing_counts(distance, crossings * [1, 1, 0.01]))
+    assert sure["unsaid_swaps"] == 1
+    assert several.crossing_figures({})["swap_calibration"] is None
+
+
 def test_errors_are_apart_or_in_contact_and_huddles_are_no_abstentions():
     distance = np.where(np.eye(2, dtype=bool), 2.0, 200.0)[None].repeat(10, axis=0)
     distance[6:] = np.where(np.eye(2, dtype=bool), 6.0, 200.0)

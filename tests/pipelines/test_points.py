@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from liex_lab.dashboards.figures.animals import joints_in_image, session_animals
+from liex_lab.pipelines.correct import correct_session
 from liex_lab.pipelines.points import (
     check_track,
     import_animals,
@@ -22,6 +23,7 @@ from liex_lab.errors import LiexError
 from liex_lab.exchange.points import PointNames, Points, read_points
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session
+from liex_lab.sessions.correcting import add_bout
 from tests.sessions.walking_mouse import WalkingMouse, steady
 
 MOUSE = WalkingMouse(steady(6.0), rear_s=(2.0, 3.5))
@@ -189,6 +191,12 @@ def test_several_animals_of_a_file_become_sessions_with_their_interactions(tmp_p
     described = set(ada.columns.loc[ada.columns["table"] == "interactions", "name"])
     assert described == set(found.columns)
     assert set(ada.metadata["interactions"]["definitions"]) >= set(found["action"])
+    correct_session(folders[0], [add_bout(ada, "groom", 1.0, 2.0)], report=False)
+    corrected = Session.open(folders[0])
+    assert set(corrected.columns.loc[corrected.columns["table"] == "interactions", "name"]) == (
+        described
+    )
+    pd.testing.assert_frame_equal(corrected.interactions, found)
     (alone,) = import_animals(file, "mouse", tmp_path / "one", individual="ada", report=False)
     assert alone.name == "pair.liex"
     assert not Session.open(alone).has("interactions.parquet")
