@@ -568,7 +568,7 @@ def evaluate_statistics(
     return api.evaluate_statistics(n_studies, effect, progress=progress)
 
 
-@benchmark("sync")
+@benchmark("sync", lambda result: print_rows(result["trains"]))
 def evaluate_sync(
     n_pairs: Annotated[
         int, typer.Option("--pairs", min=8, help="Number of simulated pairs of clocks.")

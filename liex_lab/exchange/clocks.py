@@ -254,7 +254,7 @@ def _ranked(x: Array, y: Array, reach: float, stated: Array) -> tuple[Alignment,
     best: Alignment | None = None
     for _ in range(_ROUNDS if found else 0):
         before, best = best, max(found, key=lambda one: one.score(reach))
-        if best is before:
+        if best is before or len(stated):  # stated pairs exclude every shift
             break
         follow(_shifted(x, y, best.clock, reach))
     if best is None:
@@ -275,6 +275,8 @@ def _seeds(x: Array, y: Array, reach: float, stated: Array, near: float) -> Iter
         about = [(own, other, near) for own, other in stated]
     for one, (own, other, within) in zip(rows, about, strict=True):
         window = x[one] - own
+        among = y[np.abs(y - other) <= within + 2.0 * np.ptp(window)]
+        window = window[:: min(len(among) // 100_000 + 1, 5)]  # bounds the memory
         fine = max(_FINE * reach, MOST_DRIFT * float(np.ptp(window)) / (3.0 * _MOST_RATES))
         for near_s in (reach, min(fine, reach)):
             step = 3.0 * near_s / float(np.ptp(window))
@@ -282,7 +284,9 @@ def _seeds(x: Array, y: Array, reach: float, stated: Array, near: float) -> Iter
             votes = [
                 (count, -abs(rate - 1.0), offset, rate)
                 for rate in 1.0 + step * np.arange(-n, n + 1)
-                for offset, count in _peaks(y[None] - rate * window[:, None], near_s, other, within)
+                for offset, count in _peaks(
+                    among[None] - rate * window[:, None], near_s, other, within
+                )
             ]
             kept: list[float] = []
             for count, _, offset, rate in sorted(votes, reverse=True):
@@ -300,7 +304,7 @@ def _shifted(x: Array, y: Array, clock: ClockMap, reach: float) -> Iterator[_See
 
     They are peaks of the autocorrelation, wide and narrow ones, and shifts by one event.
     """
-    chosen = x[:: len(x) // int(np.clip(2_000_000 // len(y), _WINDOW, 500)) + 1]
+    chosen = x[:: len(x) // int(np.clip(4_000_000 // len(y), _FEWEST, 500)) + 1]
     differences = y[None] - clock(chosen)[:, None]
     apart = differences[np.abs(differences) > 4.0 * reach]
     peaks = [shift for near in (reach, _FINE * reach) for shift, _ in _peaks(apart, near)]

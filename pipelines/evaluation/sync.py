@@ -78,7 +78,7 @@ def evaluate_sync(
 
     Returns:
         `median_ms` and `p99_ms` of the error of all aligned pairs, `wrong_alignment` (their
-        number), `refused` (share of all); the same for each kind; and protocol, n_pairs and seed.
+        number), `refused` (share of all); `trains`, the same by kind; and protocol, n_pairs, seed.
     """
     found: dict[str, list[Array | None]] = {kind: [] for kind in KINDS}
     for k in range(n_pairs):
@@ -91,7 +91,7 @@ def evaluate_sync(
         "n_pairs": n_pairs,
         "seed": seed,
         **_scores(every),
-        **{kind: _scores(found[kind]) for kind in KINDS if found[kind]},
+        "trains": {kind: _scores(found[kind]) for kind in KINDS},
     }
 
 
