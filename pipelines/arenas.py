@@ -38,7 +38,16 @@ from liex_lab.tracking.observations import Observations
 from .build import arenas_of, build_joint_tracker, build_recording, stated_corners
 from .choice import USUAL, fit_plan
 from .compiling import compile_ahead
-from .session import HEAVY, MEASURING, Prepared, check_unused, prepare, read_ahead, run_session
+from .session import (
+    HEAVY,
+    MEASURING,
+    Prepared,
+    check_unused,
+    observed,
+    prepare,
+    read_ahead,
+    run_session,
+)
 
 
 @dataclass(frozen=True)
@@ -246,11 +255,12 @@ def _measure_animals(
             stack.enter_context(prepared.writing(overwrite, report)) for prepared in going.values()
         ]
         shared = next(iter(going.values())).recording
-        with closing(read_ahead(shared, min(writer.n_frames for writer in writers))) as chunks:
-            for frames in chunks:
-                for writer, seen in zip(writers, joint.observe(frames), strict=True):
+        chunks = read_ahead(shared, min(writer.n_frames for writer in writers))
+        with closing(chunks), closing(observed(joint, chunks)) as coming:
+            for frames, every in coming:
+                for writer, own in zip(writers, every, strict=True):
                     left = slice(max(0, writer.n_frames - frames[0].index), None)
-                    writer.add(frames[left], observations=seen[left])
+                    writer.add(frames[left], observations=own[left])
                 progress(frames[-1].index + 1, len(shared), MEASURING)
         whole = [writer.observations(Observations) for writer in writers]
         subjects = [prepared.fitted.tracker.subject for prepared in going.values()]

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from liex_lab.dashboards.replay.layouts import replay_blueprint
@@ -198,12 +198,19 @@ def _cuts(first: int, stop: int) -> Iterator[tuple[int, int]]:
 _AT_ONCE = 2
 # imported while the first frames are measured: for the replay, `transitions` and the figures
 HEAVY = ("rerun", "scipy.special", "matplotlib.figure", "matplotlib.backends.backend_pdf")
-Observed = tuple[list[frame.DepthFrame], observations.Observations]
+Seen = TypeVar("Seen", covariant=True)
+
+
+class Observer(Protocol[Seen]):
+    """A tracker of one animal or of several."""
+
+    def observe(self, frames: list[frame.DepthFrame]) -> Seen:
+        """The observations of consecutive frames."""
 
 
 def observed(
-    tracker: FrameTracker, stretches: Iterable[list[frame.DepthFrame]]
-) -> Generator[Observed, None, None]:
+    tracker: Observer[Seen], stretches: Iterable[list[frame.DepthFrame]]
+) -> Generator[tuple[list[frame.DepthFrame], Seen], None, None]:
     """Stretches of frames with their single-frame observations, in order.
 
     Args:
@@ -220,7 +227,7 @@ def observed(
         for frames in stretches:
             yield frames, tracker.observe(frames)
         return
-    waiting: deque[tuple[list[frame.DepthFrame], Future[observations.Observations]]] = deque()
+    waiting: deque[tuple[list[frame.DepthFrame], Future[Seen]]] = deque()
     # matrix products are serial meanwhile: the limit is per process, not per thread
     with (
         processes.serial_products(),
@@ -241,8 +248,8 @@ def observed(
 
 
 def _first(
-    waiting: deque[tuple[list[frame.DepthFrame], Future[observations.Observations]]],
-) -> Observed:
+    waiting: deque[tuple[list[frame.DepthFrame], Future[Seen]]],
+) -> tuple[list[frame.DepthFrame], Seen]:
     """The oldest stretch, once it is measured."""
     frames, coming = waiting.popleft()
     return frames, coming.result()

@@ -253,9 +253,11 @@ def _crossings(
         p = np.exp(cost.min(axis=1, keepdims=True) - cost)
         p_swap, by_motion = 1.0 - p[:, path[end]] / p.sum(axis=1)
         decided_by = "size" if by_motion > max(2.0 * p_swap, 0.02) else "motion"
-        other = np.argsort(cost[0])[:2]
-        changed = states[other[0]] != states[other[1]]
-        animals = tuple(int(k) for k in np.flatnonzero(changed))
+        # of each animal, and of those of the likeliest exchange at least
+        exchanged = p[0] @ (states != states[path[end]]) / p[0].sum()
+        second = states[np.argsort(cost[0])[:2]]
+        some = (exchanged > 0.1 * p_swap) | (second[0] != second[1])
+        animals = tuple(int(k) for k in np.flatnonzero(some))
         found.append(
             Crossing(int(full[begin]), int(full[end]) + 1, animals, float(p_swap), decided_by)
         )

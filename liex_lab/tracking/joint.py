@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.body.skeleton import VIEWS
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
@@ -93,6 +94,7 @@ class JointTracker:
             )
         groups = np.cumsum(np.diff(-np.log(area), prepend=-np.log(area[0])) > _SAME_SIZE)
         trackers: list[FrameTracker] = []
+        heights: list[float] = []
         for group in np.unique(groups):
             ranks = np.flatnonzero(groups == group)
             own = np.concatenate([images[rank][k :: len(ranks)] for k, rank in enumerate(ranks)])
@@ -106,11 +108,11 @@ class JointTracker:
                 bridge_s=alone.bridge_s,
                 adapt=alone.shape is not None,
             )
+            heights.append(usual.volume_mm3 / usual.area_mm2)
             trackers += [replace(tracker, n_measured=n_animals)] * len(ranks)
         # the smallest animal and all of them together are equally far from this area
         middle = float(np.sqrt(area[-1] * area.sum()))
-        height_mm = scene.volume_mm3 / scene.area_mm2
-        return JointTracker(replace(scene, area_mm2=middle), tuple(trackers), height_mm)
+        return JointTracker(replace(scene, area_mm2=middle), tuple(trackers), heights[0])
 
     @property
     def estimator(self) -> PoseEstimator:
@@ -221,7 +223,7 @@ class JointTracker:
         """Which components (n,) are as large and high as one of the animals or several of them."""
         area = np.where(crops.found, crops.blobs.area_mm2, 0.0)
         right = area >= self._least_mm2
-        if not self._camera_view:  # else there is no floor below them
+        if self.scene.view.frame == VIEWS[0]:  # swimming animals are at any height
             height = crops.blobs.volume_mm3 / np.maximum(area, 1e-9) / self.height_mm
             right &= (height > ANIMAL_HEIGHTS[0]) & (height < ANIMAL_HEIGHTS[1])
         return np.asarray(right)
@@ -395,8 +397,10 @@ def _one_by_one(
     rows = np.arange(n_animals)[:, None] * n + np.arange(n)
     blobs = crops.blobs
     height = blobs.volume_mm3 / np.maximum(blobs.area_mm2, 1e-9)
-    animals = crops.found & (height > ANIMAL_HEIGHTS[0] * scene.volume_mm3 / scene.area_mm2)
-    animals &= crops.n_px < _TORN * blobs.n_px * (crops.step // scene.stride) ** 2
+    animals = crops.found.copy()
+    if scene.view.frame == VIEWS[0]:
+        animals &= height > ANIMAL_HEIGHTS[0] * np.median(height[:n][crops.found[:n]])
+    animals &= crops.n_px < _TORN * blobs.n_px * crops.step**2
     animals &= blobs.area_mm2 > _LEAST_SHARE * np.tile(blobs.area_mm2[rows].max(axis=0), n_animals)
     apart = np.flatnonzero(animals[rows].all(axis=0))
     if len(apart) < _FEWEST:

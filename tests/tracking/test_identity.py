@@ -81,8 +81,10 @@ def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_i
     seen = mixed(2, order)
     lose(seen, LOST)
     later = slice(LOST.stop, None)
-    middle = 0.5 * (seen.place[later, :1] + seen.place[later, 2:3])
-    seen.place[later] = middle + 0.15 * (seen.place[later] - middle)  # they part slowly
+    middle = 0.5 * (seen.place[:, :1] + seen.place[:, 2:3])
+    apart = np.clip(np.abs(np.arange(len(SECONDS)) - 47.0) / 400.0, 0.0, 1.0)  # they meet slowly
+    seen.place[:] = middle + apart[:, None, None] * (seen.place - middle)
+    seen.centroid_mm[:] = seen.place
     seen.n_px[:, :2] = round(800 * ratio)
     areas = [2000.0 * ratio, 2000.0]
     found = identify([seen] * 2, [SUBJECT] * 2, areas)
