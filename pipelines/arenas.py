@@ -258,9 +258,9 @@ def _measure_animals(
         chunks = read_ahead(shared, min(writer.n_frames for writer in writers))
         with closing(chunks), closing(observed(joint, chunks)) as coming:
             for frames, every in coming:
-                for writer, found in zip(writers, every, strict=True):
+                for writer, own in zip(writers, every, strict=True):
                     left = slice(max(0, writer.n_frames - frames[0].index), None)
-                    writer.add(frames[left], observations=found[left])
+                    writer.add(frames[left], observations=own[left])
                 progress(frames[-1].index + 1, len(shared), MEASURING)
         whole = [writer.observations(Observations) for writer in writers]
         subjects = [prepared.fitted.tracker.subject for prepared in going.values()]

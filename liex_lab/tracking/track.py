@@ -248,7 +248,7 @@ class Crossing:
         start: first frame.
         stop: frame after the last.
         animals: which of them, from 0.
-        p_swap: probability that they leave it in other roles than the tracks state.
+        p_swap: probability that they leave it in other roles than in the tracks.
         decided_by: what decided it: motion or size.
     """
 
