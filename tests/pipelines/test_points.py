@@ -24,6 +24,7 @@ from liex_lab.exchange.points import PointNames, Points, read_points
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session
 from liex_lab.sessions.correcting import add_bout
+from tests.conftest import ABSENT
 from tests.sessions.walking_mouse import WalkingMouse, steady
 
 MOUSE = WalkingMouse(steady(6.0), rear_s=(2.0, 3.5))
@@ -213,7 +214,7 @@ def test_no_session_is_written_if_one_of_several_animals_cannot_be_used(tmp_path
 REAL = Path(__file__).parents[2].parent / "shared/data/mouse_actions_3d/adult_6112.npz"
 
 
-@pytest.mark.skipif(not REAL.is_file(), reason="the real mice's points are not on this computer")
+@pytest.mark.skipif(not REAL.is_file(), reason=ABSENT)
 def test_points_of_a_real_mouse_pass_the_checks():
     found = read_points(REAL)
     mapped = PointNames().of_joints(SKELETON.names, found.names)
