@@ -99,6 +99,9 @@ def own_observations(observed: Observations, slots: Slots) -> Observations:
         elif name != "times_ns":
             for h in range(2):
                 out[rows, h] = values[rows, 2 * slots[rows] + h]
+    # of an outline that a neighbour cuts, the metric does not know which end is the head
+    touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < observed.score.shape[1] // 2
+    own.score[touching, :2] = own.score[touching, :2].min(axis=1, keepdims=True)
     return own
 
 

@@ -17,7 +17,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.evaluation.scores import MeasuredIndividual
 from liex_lab.optics.camera import Camera
-from tests.conftest import REFERENCE_DATA
+from tests.conftest import ABSENT, REFERENCE_DATA
 
 MOUSE = Skeleton.load("mouse")
 SHARES = MOUSE.reach / MOUSE.length
@@ -227,7 +227,7 @@ def test_own_bodies_are_scored_and_sealed_ones_are_others(monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.skipif(not FOREIGN.is_dir(), reason="foreign recordings are not beside the project")
+@pytest.mark.skipif(not FOREIGN.is_dir(), reason=ABSENT)
 def test_given_foreign_bodies_are_measured():
     result = foreign.evaluate_foreign("fish", truth=FOREIGN / "fish28_truth.npz")
     assert result["rows"]["fish28"]["found"] > 0.9
