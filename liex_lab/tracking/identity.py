@@ -106,9 +106,12 @@ def own_observations(observed: Observations, slots: Slots) -> Observations:
 
 
 def flag_unclear(tracked: Tracked) -> None:
-    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are."""
+    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are, and in
+    a crossing that begins before the animal stood apart, as its head is unknown there.
+    """
+    first = int(np.argmax(tracked.track.posed))
     for one in tracked.crossings or ():
-        if one.p_swap > UNCLEAR:
+        if one.p_swap > UNCLEAR or one.start <= first:
             flag = tracked.track.flag[one.start : one.stop]
             flag[flag == ""] = "doubtful"
 

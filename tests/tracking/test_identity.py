@@ -101,8 +101,12 @@ def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_i
 def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
     unclear = Crossing(10, 20, (0, 1), 0.3, "motion")
     clear = Crossing(30, 40, (0, 1), 0.01, "motion")
-    tracked = replace(track_whole(SUBJECT, told(SECONDS, WALKS[0])), crossings=(unclear, clear))
+    from_the_start = Crossing(0, 4, (0, 1), 0.0, "motion")
+    tracked = replace(
+        track_whole(SUBJECT, told(SECONDS, WALKS[0])), crossings=(from_the_start, unclear, clear)
+    )
     flag_unclear(tracked)
-    assert np.flatnonzero(tracked.track.flag == "doubtful").tolist() == list(range(10, 20))
+    doubtful = np.flatnonzero(tracked.track.flag == "doubtful").tolist()
+    assert doubtful == [*range(4), *range(10, 20)]
     assert doubt([Crossing(0, 1, (0, 1), 1.0 - CERTAIN - 1e-9, "motion")]) == ""
     assert "70% certain" in doubt([unclear])
