@@ -141,9 +141,7 @@ def measure(
     recording = simulator.tracking_sequence(
         simulator.world_of(Skeleton.load(animal)), kind, seed=seed, n_frames=n_frames
     )
-    return observed(
-        estimator_of(animal, "default", progress), plan_of(animal), kind, recording, progress
-    )
+    return _observed_all(animal, kind, [recording], progress)[0]
 
 
 def other_builds(
@@ -162,10 +160,8 @@ def other_builds(
     world = simulator.world_of(Skeleton.load(animal))
     if not world.other_builds:
         return []
-    estimator = estimator_of(animal, "default", progress)
-    plan = plan_of(animal)
     recordings = [world.motion([seed], 120, family="other") for seed in seeds]
-    return [observed(estimator, plan, "other", one, progress) for one in recordings]
+    return _observed_all(animal, "other", recordings, progress)
 
 
 def foreign_bodies(
@@ -183,10 +179,18 @@ def foreign_bodies(
     """
     if animal not in KINDS:
         return []
-    estimator = estimator_of(animal, "default", progress)
-    plan = plan_of(animal)
     recordings = [ForeignRecording(animal, body, body, 120) for body in bodies]
-    return [observed(estimator, plan, "foreign", one, progress) for one in recordings]
+    return _observed_all(animal, "foreign", recordings, progress)
+
+
+def _observed_all(
+    animal: str,
+    kind: str,
+    recordings: Sequence[RenderedRecording | ForeignRecording],
+    progress: Progress,
+) -> list[Measured]:
+    estimator, plan = estimator_of(animal, "default", progress), plan_of(animal)
+    return [observed(estimator, plan, kind, one, progress) for one in recordings]
 
 
 def observed(
