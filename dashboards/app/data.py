@@ -22,6 +22,7 @@ from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, corrections, verdict
+from liex_lab.tracking.track import DOUBTFUL
 
 from ..figures.animals import Recent
 from ..report.report import warnings
@@ -343,7 +344,7 @@ def _quality(session: Session) -> dict[str, Any]:
         "duration_min": frames["duration_s"] / 60.0,
         "n_frames": frames["n_frames"],
         "posed_share": frames["n_observed"] / n,
-        "doubtful_share": frames["flags"].get("doubtful", 0) / n,
+        "doubtful_share": sum(frames["flags"].get(flag, 0) for flag in DOUBTFUL) / n,
         "n_gaps": frames["n_gaps"],
         "n_missing": frames["n_missing"],
         "predicted_error_mm": float(error.median()),

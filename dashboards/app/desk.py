@@ -18,6 +18,7 @@ from liex_lab.actions.vocabulary import action_colours
 from liex_lab.behaviour.kinematics import IMPOSSIBLE_MM_S
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session, correcting, corrections, evidence
+from liex_lab.tracking.track import DOUBTFUL
 
 from ..figures.animals import Array, DepthImages, SessionAnimal
 from ..report.contact_sheet import png
@@ -116,7 +117,7 @@ class Desk(Footage):
 
     def doubts(self) -> list[Stretch]:
         """Doubtful stretches of poses in order of time."""
-        rows = np.flatnonzero(self._numbers["flag"].astype(str) == "doubtful")
+        rows = np.flatnonzero(np.isin(self._numbers["flag"].astype(str), DOUBTFUL))
         error = self._numbers["predicted_error_mm"].astype(float)
         found = []
         for run in _runs(self.time_s[rows], self.time_s[rows]):

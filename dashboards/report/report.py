@@ -16,6 +16,7 @@ from liex_lab.optics.camera import SensorCard
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session, correcting, verdict
 from liex_lab.sessions.session import found_video
+from liex_lab.tracking.track import DOUBTFUL
 
 from ..figures.animals import FRAMES, KINEMATICS
 from ..figures.sets import FOLDER, for_the_page
@@ -46,6 +47,7 @@ def methods(session: Session) -> list[str]:
         spine=spine_mm(session),
         error=session.frames["predicted_error_mm"].median(),
         optics=optics(session),
+        doubtful=_n_doubtful(about["frames"]),
         corrections=about.get("corrections"),
         rules=about.get("rules"),
         sources=sources,
@@ -89,7 +91,7 @@ def warnings(session: Session) -> list[str]:
         n_beside=_unmeasured(about),
         hidden=hidden,
         lost=frames["n_frames"] - frames["n_observed"] - hidden,
-        doubtful=int(frames["flags"].get("doubtful", 0)),
+        doubtful=_n_doubtful(frames),
         error=error,
         spine=spine,
         flips=session.flips,
@@ -107,6 +109,11 @@ def warnings(session: Session) -> list[str]:
         error_share=0.1,  # of the length
         noise_share=1.0,  # of the pause threshold
     )
+
+
+def _n_doubtful(frames: dict[str, Any]) -> int:
+    """Measured poses that are not trusted."""
+    return sum(frames["flags"].get(flag, 0) for flag in DOUBTFUL)
 
 
 def _recogniser(session: Session) -> dict[str, Any]:
@@ -190,16 +197,17 @@ def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
     """The classification of all frames that the camera should have taken.
 
     Returns:
-        (class, share, number, CSS class for its colour) of trusted, doubtful, hidden, lost and
-            undelivered frames; hidden ones only if present.
+        (class, share, number, CSS class for its colour) of trusted, doubtful, unclear, hidden, lost
+            and undelivered frames; unclear and hidden ones only if present.
     """
     frames = session.metadata["frames"]
-    doubtful = int(frames["flags"].get("doubtful", 0))
+    doubtful, unclear = (int(frames["flags"].get(flag, 0)) for flag in DOUBTFUL)
     hidden = int(frames["flags"].get("hidden", 0))
     lost = frames["n_frames"] - frames["n_observed"] - hidden
     parts = [
-        ("trusted pose", frames["n_observed"] - doubtful, "good"),
+        ("trusted pose", frames["n_observed"] - doubtful - unclear, "good"),
         ("doubtful pose", doubtful, "doubt"),
+        *([("unclear which animal", unclear, "doubt")] if unclear else []),
         *([("hidden", hidden, "gone")] if hidden else []),
         ("no pose", lost, "lost"),
         ("not delivered", frames["n_missing"], "gone"),

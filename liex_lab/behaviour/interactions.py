@@ -10,8 +10,9 @@ mid-axes, as thick as the skeleton's body:
     gap = min_ij |a_i - b_j| - r_i - r_j    (mm),  a_i, b_j: points along the two mid-axes.
 
 Frames in which either animal has no trusted pose are not observed: no interaction includes them,
-and shares are of the observed time of the pair. Sources: Live Mouse Tracker (de Chaumont et al.
-2019, Nature Biomedical Engineering 3:930) and deepof (Bordes et al. 2023, Nature Communications
+and shares are of the observed time of the pair. Frames in which it is not clear which of them is
+which count for mutual words only, without a direction. Sources: Live Mouse Tracker (de Chaumont et
+al. 2019, Nature Biomedical Engineering 3:930) and deepof (Bordes et al. 2023, Nature Communications
 14:4319).
 """
 
@@ -64,18 +65,21 @@ class Individual:
         skeleton: a chain of J joints.
         joints_mm: (n, J, 3) arena frame; NaN without a pose.
         trusted: (n,) bool, whether the pose was measured and nothing contradicts it.
+        clear: (n,) bool, whether it is clear that this is the animal; None if it always is.
     """
 
     name: str
     skeleton: Skeleton
     joints_mm: Array
     trusted: Mask
+    clear: Mask | None = None
 
     @staticmethod
     def of_track(name: str, track: Track) -> Individual:
         """The animal of a track."""
-        trusted = track.observed & np.isin(track.flag, ["", CORRECTED])
-        return Individual(name, track.skeleton, track.joints_mm, trusted)
+        clear = np.asarray(track.flag != "unclear")
+        trusted = track.observed & (np.isin(track.flag, ["", CORRECTED]) | ~clear)
+        return Individual(name, track.skeleton, track.joints_mm, trusted, clear)
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,9 @@ def find_interactions(
         frame_index: (n,) index of each frame in the recording; None counts from 0.
     """
     limits = limits or InteractionThresholds()
-    arena = _Arena(time_s, [_Course.of(one, time_s, limits) for one in animals], limits)
+    every = np.ones(len(time_s), np.bool_)
+    clear = np.stack([every if one.clear is None else one.clear for one in animals])
+    arena = _Arena(time_s, [_Course.of(one, time_s, limits) for one in animals], clear, limits)
     found = sorted(arena.events(), key=lambda event: (event.start, event.stop, event.word))
     start, stop = np.array([(one.start, one.stop) for one in found], np.int64).reshape(-1, 2).T
     count = frame_count(np.arange(len(time_s)) if frame_index is None else frame_index)
@@ -304,13 +310,18 @@ class _Arena:
     Args:
         time_s: (n,) s.
         animals: their courses.
+        clear: (A, n) bool, whether it is clear which animal it is.
         limits: the thresholds.
     """
 
     def __init__(
-        self, time_s: Array, animals: Sequence[_Course], limits: InteractionThresholds
+        self,
+        time_s: Array,
+        animals: Sequence[_Course],
+        clear: Mask,
+        limits: InteractionThresholds,
     ) -> None:
-        self.time_s, self.animals, self.limits = time_s, animals, limits
+        self.time_s, self.animals, self.clear, self.limits = time_s, animals, clear, limits
         self.stop_s = stop_times(time_s)
         self.known = np.stack([np.isfinite(one.centre[:, 0]) for one in animals])
 
@@ -322,9 +333,12 @@ class _Arena:
             for i, j in permutations(range(len(self.animals)), 2)
         }
 
-    def observed(self, *animals: int) -> Mask:
-        """(n,) bool, the frames in which these animals, or all, have a trusted pose."""
-        return np.asarray(self.known[list(animals) or slice(None)].all(axis=0))
+    def observed(self, *animals: int, mutual: bool = False) -> Mask:
+        """(n,) bool, the frames in which these animals, or all, have a trusted pose, and it is
+        clear which is which unless the word is mutual.
+        """
+        known = self.known if mutual else self.known & self.clear
+        return np.asarray(known[list(animals) or slice(None)].all(axis=0))
 
     def events(self) -> Iterator[_Event]:
         """Every interaction; pair by pair, not in order of time."""
@@ -350,18 +364,19 @@ class _Arena:
 
     def _of_pair(self, i: int, j: int) -> Iterator[_Event]:
         """The interactions of two animals."""
-        observed = self.observed(i, j)
-        number = segments(self.time_s, observed)
+        seen = [self.observed(i, j, mutual=mutual) for mutual in (False, True)]
+        numbers = [segments(self.time_s, one) for one in seen]
         ways = ((i, j), (j, i))
-        margins = {way: self._margins(*way, number) for way in ways}
-        free = {way: observed.copy() for way in ways}
-        done = {word: np.zeros(len(observed), np.bool_) for word in WORDS}  # by either animal
+        margins = {way: self._margins(*way, numbers[False]) for way in ways}
+        free = {way: seen[True].copy() for way in ways}
+        done = {word: np.zeros(len(seen[True]), np.bool_) for word in WORDS}  # by either animal
         for word in (word for word in WORDS if word in margins[ways[0]]):
             rule = WORDS[word]
+            observed, number = seen[rule.mutual], numbers[rule.mutual]
             without = np.any([done[one] for one in rule.not_in], axis=0)
             for way in ways[:1] if rule.mutual else ways:
                 taken = ways if rule.mutual else (way,)
-                room = np.all([free[one] for one in taken], axis=0)
+                room = np.all([free[one] for one in taken], axis=0) & observed
                 room = observed & ~without if rule.layered else room
                 for start, stop, score in self._spans(word, margins[way][word], room, number):
                     rows = slice(start, stop)
@@ -504,6 +519,7 @@ class _Arena:
         ]
         pair = (i, j) if came[0] >= came[1] else (j, i)
         directed = max(came) >= max(2.0 * min(came), self.limits.contact_mm)
+        directed &= bool(self.clear[[i, j], first:stop].all())
         return _Event(*pair, word, start, stop, score, directed)
 
 
@@ -514,12 +530,13 @@ def _totals(arena: _Arena, found: Sequence[_Event], names: Sequence[str]) -> pd.
     rows = []
     pairs = [*permutations(range(len(names)), 2), *((i, -1) for i in range(len(names)))]
     for agent, target in pairs:
-        observed = arena.observed() if target < 0 else arena.observed(agent, target)
-        observed_s = float(hold[observed].sum())
-        first_s = float(arena.time_s[observed][0]) if observed.any() else np.nan
         for word, one in WORDS.items():
             if (word == "isolated") != (target < 0) or (swims and word in _WALKERS):
                 continue
+            both = () if target < 0 else (agent, target)
+            observed = arena.observed(*both, mutual=one.mutual)
+            observed_s = float(hold[observed].sum())
+            first_s = float(arena.time_s[observed][0]) if observed.any() else np.nan
             either = ((agent, target), (target, agent)) if one.mutual else ((agent, target),)
             own = [event for event in found if event.word == word and event[:2] in either]
             total_s = float(sum(hold[event.start : event.stop].sum() for event in own))

@@ -35,7 +35,7 @@ from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import BEHAVIOUR, GAPS, Vocabulary, empty_table, rears_of, to_pandas
-from liex_lab.tracking.track import ends_of
+from liex_lab.tracking.track import DOUBTFUL, ends_of
 
 if TYPE_CHECKING:
     from liex_lab.tables.rows import Rows
@@ -268,7 +268,7 @@ def summarise(
         "individual": str(frames["individual"].iloc[0]),
         "n_frames": len(frames),
         "n_lost": int((~observed).sum()),
-        "n_doubtful": int((frames["flag"] == "doubtful").sum()),
+        "n_doubtful": int(frames["flag"].isin(DOUBTFUL).sum()),
         "duration_s": float(stop_times(time_s)[-1]),
         "observed_s": float(hold.sum()),
         "spine_mm": _median(frames["spine_mm"]) if "spine_mm" in frames else np.nan,

@@ -59,6 +59,7 @@ TRACKING = "ethogram/tracking"
 _BLOCK = 8192  # frames of small data sent at once
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
+    "unclear": 0xEE7733,
     "not_found": int(vocabulary.NO_POSE[1:], 16),
     "hidden": 0xAA3377,
     "no_depth": 0xBBBBBB,

@@ -15,7 +15,7 @@ import numpy as np
 
 from liex_lab.runtime.text_files import loose_json
 from liex_lab.tracking.observations import Observations
-from liex_lab.tracking.track import Tracked
+from liex_lab.tracking.track import DOUBTFUL, Tracked
 
 NEEDS_REVIEW = "needs review"
 CAUTION = "note"
@@ -85,7 +85,7 @@ class Verdict:
         n_in_view = min(int(observations.known.any(axis=1).sum()), n_depth)
         n_posed = int(track.observed.sum())
         n_trusted = int((track.observed & (track.flag == "")).sum())
-        n_doubtful = int((track.flag == "doubtful").sum())
+        n_doubtful = int(np.isin(track.flag, DOUBTFUL).sum())
         errors = track.predicted_error_mm[track.observed]
         reasons = [*misfits, *doubts]
         crowded = int((track.n_animals > n_measured).sum())

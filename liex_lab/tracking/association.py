@@ -70,7 +70,10 @@ class HypothesisAssociation:
         Returns:
             (n, H, k, 3) mm, float32, arena frame, NaN if there is no hypothesis; k is at most 8.
         """
-        return observed.joints(self._joints, allocate)
+        joints = observed.joints(self._joints, allocate)
+        rows, h = _undirected(observed)
+        joints[rows, h] = joints[rows, h ^ 1, ::-1]
+        return joints
 
     def path(
         self,
@@ -107,7 +110,7 @@ class HypothesisAssociation:
         # 24 chains are kept
         chains = kernels.Chains(np.zeros((24, 2), np.int64), allocate((n, h), float), parent)
         frames = kernels.Hypotheses(
-            observed.seconds, joints, observed.error_mm, emission, missed_cost
+            observed.seconds, joints, _errors(observed), emission, missed_cost
         )
         n_beam = 0
         for rows in blocks(n, _BLOCK):
@@ -231,12 +234,35 @@ class HypothesisAssociation:
             one[part] = joints[used[part], taken[part]]
             other_way = joints[used[part], taken[part] ^ 1]
             two[part] = np.where(np.isfinite(other_way), other_way, one[part, ::-1])
-        error = observed.error_mm[used, taken].astype(float)
+        error = _errors(observed)[used, taken].astype(float)
         at_used = np.empty(len(used))
         kernels.forward_backward(
             observed.seconds[used], one, two, error, evidence, self.costs, at_used
         )
         return np.interp(np.arange(len(path)), used, at_used)
+
+
+def _undirected(observed: Observations) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Frames (k,) and hypotheses (k,) that score as their reversal and have a larger error.
+
+    The image does not tell these ends apart. Nor may the jitter of two fits: over a long contact it
+    would outweigh the directions before and after. The transitions of both directions are therefore
+    those of the better fit, and the cost of a half turn is all that separates them.
+    """
+    other = np.arange(observed.score.shape[1]) ^ 1
+    tied = observed.score == observed.score[:, other]
+    rows, h = np.nonzero(tied & (observed.error_mm > observed.error_mm[:, other]))
+    return rows, h
+
+
+def _errors(observed: Observations) -> NDArray[np.float32]:
+    """Predicted errors (n, H) mm for transition costs, see `_undirected`."""
+    rows, h = _undirected(observed)
+    if not len(rows):
+        return observed.error_mm
+    error = observed.error_mm.copy()
+    error[rows, h] = error[rows, h ^ 1]
+    return error
 
 
 def backward_cost(observed: Observations, ahead: NDArray[np.float32], length_mm: float) -> Array:

@@ -22,6 +22,7 @@ from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.observations import COLUMNS, Array, Observations
 from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Crossing, Subject, Tracked, spans
+from liex_lab.tracking.trust import MOST_ERROR, contradicted
 
 Slots = NDArray[np.int64]
 
@@ -33,6 +34,7 @@ _VELOCITY_S = 0.2  # time over which their velocity is measured
 _PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
 _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
+_COVERED = 0.35  # hidden area, in animals, from which their poses are unknown
 _JOIN_S = 0.5  # crossings nearer to each other are one
 
 
@@ -65,14 +67,13 @@ def identify(
     slots = np.full((len(known), n_animals), NONE, np.int64)
     states = np.array(list(permutations(range(n_animals))))
     crossings: tuple[Crossing, ...] = ()
-    moves = np.zeros((0, n_animals, n_animals, n_animals))
     if len(full):
-        moves = np.stack(
-            [_moves(one[full], subject) for one, subject in zip(observed, subjects, strict=True)], 1
+        # of all bodies: how smoothly each fits a component does not show whose component it is
+        moves = np.min(
+            [_moves(one[full], subject) for one, subject in zip(observed, subjects, strict=True)], 0
         )
-        animals = np.arange(n_animals)
         # cost (m - 1, S, S) of going from one assignment to another
-        transition = moves[:, animals, states[:, None, :], states[None, :, :]].sum(axis=-1)
+        transition = moves[:, states[:, None, :], states[None, :, :]].sum(axis=-1)
         emission = _sizes(observed[0][full], np.array(areas_mm2), states)
         path = _viterbi(transition, emission)
         _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
@@ -99,21 +100,34 @@ def own_observations(observed: Observations, slots: Slots) -> Observations:
         elif name != "times_ns":
             for h in range(2):
                 out[rows, h] = values[rows, 2 * slots[rows] + h]
-    # of an outline that a neighbour cuts, the metric does not know which end is the head
     touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < observed.score.shape[1] // 2
+    own.behind[touching, :2] = _covering(observed, touching)[touching, None]
+    # of an outline that a neighbour cuts, the metric does not know which end is the head
+    touching &= own.known[:, 0] & own.known[:, 1]
     own.score[touching, :2] = own.score[touching, :2].min(axis=1, keepdims=True)
     return own
 
 
+def _covering(observed: Observations, touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether (n,) touching animals cover each other: all in view show too little together."""
+    known = observed.known[:, ::2]
+    shown = np.where(known, observed.n_px[:, ::2], 0).sum(axis=1)
+    apart = known.all(axis=1) & ~touching
+    usual = np.median(shown[apart]) / known.shape[1] if apart.any() else np.inf
+    return np.asarray(touching & (shown < (known.sum(axis=1) - _COVERED) * usual))
+
+
 def flag_unclear(tracked: Tracked) -> None:
-    """Flag the poses of a track as doubtful, in place, where it is not clear whose they are, and in
+    """Flag the poses of a track in place: unclear where it is not clear whose they are, doubtful in
     a crossing that begins before the animal stood apart, as its head is unknown there.
     """
     first = int(np.argmax(tracked.track.posed))
     for one in tracked.crossings or ():
-        if one.p_swap > UNCLEAR or one.start <= first:
-            flag = tracked.track.flag[one.start : one.stop]
+        flag = tracked.track.flag[one.start : one.stop]
+        if one.start <= first:
             flag[flag == ""] = "doubtful"
+        elif one.p_swap > UNCLEAR:
+            flag[flag == ""] = "unclear"
 
 
 def doubt(crossings: Sequence[Crossing]) -> str:
@@ -136,8 +150,13 @@ def _moves(observed: Observations, subject: Subject) -> Array:
     """Cost (m - 1, N, N) of one animal's way from each component to each of the next frame."""
     tuning = TrackingParameters.of(subject.skeleton.name).chain
     chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning, 2)
-    out = np.empty((max(len(observed) - 1, 0), *(observed.score.shape[1] // 2,) * 2))
-    _transitions(observed.seconds, chain.joints(observed), observed.error_mm, chain.costs, out)
+    n, n_hypotheses = observed.score.shape
+    error = observed.error_mm.copy()
+    for h in range(n_hypotheses):  # poses of animals that cover each other may be anywhere on them
+        wrong = contradicted(observed, np.full(n, h), subject.length_mm)
+        error[wrong, h] = np.maximum(error[wrong, h], MOST_ERROR * subject.length_mm)
+    out = np.empty((max(n - 1, 0), *(n_hypotheses // 2,) * 2))
+    _transitions(observed.seconds, chain.joints(observed), error, chain.costs, out)
     return out
 
 

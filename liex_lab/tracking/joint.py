@@ -34,7 +34,7 @@ from liex_lab.scene._blob_kernels import N_PX, SLOPE, back_slope, blob_moments
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.height_maps import ANIMAL_HEIGHTS, N_OBJECTS, HeightMaps
 from liex_lab.tracking.observations import Array, Observations
-from liex_lab.tracking.residual import behind_something, render_crops
+from liex_lab.tracking.residual import render_crops
 from liex_lab.tracking.tracker import FrameTracker
 
 Mask = NDArray[np.bool_]
@@ -49,7 +49,6 @@ _N_DIRECTIONS = 4  # of the cuts, in half a turn
 _KEPT = 2  # explanations that are improved
 _SWEEPS = 2
 _MOST_OFF = 0.2  # of a pixel, in roots of the animal's area
-_OVER_MM = 8.0  # an animal over the edge of another one is nearer by this much
 _BETTER = 0.85  # cost of several bodies over that of one
 
 
@@ -183,11 +182,6 @@ class JointTracker:
         hypotheses = self.estimator.both_directions(detections, body.size)
         poses = [body.put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
         body.put_agreement(observed, hypotheses, poses, cleared)
-        touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < len(detections)
-        for h in range(0, len(hypotheses), 2):  # one animal may lie over the edge of another
-            rows = np.flatnonzero(touching & hypotheses[h].found)
-            behind = behind_something(hypotheses[h].crops[rows], cleared[rows], _OVER_MM)
-            observed.behind[rows, h] = observed.behind[rows, h + 1] = behind
 
     def _parts(self, crops: HeightMaps, depths: NDArray[np.float32]) -> HeightMaps:
         """The height map of each animal, as far as it is in view: N n rows, part by part.

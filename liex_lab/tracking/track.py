@@ -24,6 +24,8 @@ from liex_lab.runtime.memory import Allocator, Rows, blocks
 Array = NDArray[np.float64]
 
 _BLOCK = 16_384  # frames in memory at once
+# flags of measured poses that are not trusted: off, or not clearly this animal's
+DOUBTFUL = ("doubtful", "unclear")
 CORRECTED = "corrected"  # flag of a pose with manually placed joints
 
 

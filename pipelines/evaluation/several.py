@@ -164,7 +164,8 @@ def _named(
             str(taken[k]),
             recording.skeleton,
             one.joints_camera @ one.R_arena_camera.T,
-            one.trusted,
+            one.trusted | one.unclear,
+            ~one.unclear,
         )
         for k, one in enumerate(individuals)
     ]

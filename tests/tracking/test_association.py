@@ -167,3 +167,20 @@ def test_head_and_tail_of_one_of_two_animals_are_told_as_those_of_a_lone_one():
     seen.score[:, [0, 2]], seen.score[:, [1, 3]] = seen.score[:, [1, 3]], seen.score[:, [0, 2]]
     path = path_of(HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2), seen)
     assert (path % 2 == 1).all()
+
+
+def test_in_a_long_contact_the_smoother_fit_does_not_turn_an_animal_round():
+    clock = np.arange(300) / 30.0
+    seen = told(clock, walk(clock))
+    touching = slice(30, 270)
+    seen.score[touching] = 3.0  # of both directions: the metric does not know them
+    rng = np.random.default_rng(2)
+    seen.place[touching, 0] += rng.normal(0.0, 5.0, (240, 3))
+    seen.error_mm[touching, 0] = rng.choice([3.0, 12.0], 240)
+    joints = CHAIN.joints(seen)
+    emission = CHAIN.emission(seen, joints)
+    path = CHAIN.path(seen, joints, emission)
+    found = joints[np.arange(300), path]
+    ahead = np.einsum("nd,nd->n", found[:, -1] - found[:, 0], joints[:, 0, -1] - joints[:, 0, 0])
+    assert (ahead[path != NONE] > 0.0).all()
+    assert CHAIN.doubt(seen, path, joints, emission).max() < 0.5

@@ -153,7 +153,7 @@ export class Stage {
       data.animals.forEach((_, animal) => {
         const uv = this.uvOf(animal);
         posed = posed || uv !== null;
-        if (uv) this.bones(uv, animal, dots, data.flag === "doubtful");
+        if (uv) this.bones(uv, animal, dots, ["doubtful", "unclear"].includes(data.flag));
       });
       if (!posed) this.note("no pose in this frame", dots);
     }
