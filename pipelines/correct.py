@@ -7,7 +7,7 @@ replaces the folder as a whole, and its predecessor is removed only once the new
 
 import json
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields, replace
@@ -208,19 +208,17 @@ def _refuse_moved(session: Session, log: corrections.Log, names: Sequence[str]) 
     own = names.index(session.metadata["individual"])
     was, now = (identities.shown(one.shared, names, index)[:, own] for one in (before, log))
 
-    def touches(what: corrections.Correction | None) -> bool:
-        """Whether a correction is of a frame that another animal gets."""
-        match what:
-            case corrections.FlipSpan(start, stop):
-                return bool((moved[(start <= index) & (index < stop)]).any())
-            case corrections.JointMove(frame):
-                return bool(moved[index == frame].any())
-            case corrections.BoutEdit(_, _, start, stop):
-                return bool(moved[(start <= times) & (times < stop)].any())
-        return False
-
     moved = was != now
-    numbers = [str(entry.number) for entry in before.standing if touches(entry.what)]
+    rows: dict[type, Callable[[Any], NDArray[np.bool_]]] = {
+        corrections.FlipSpan: lambda one: (one.start_frame <= index) & (index < one.stop_frame),
+        corrections.JointMove: lambda one: index == one.frame,
+        corrections.BoutEdit: lambda one: (one.start_ns <= times) & (times < one.stop_ns),
+    }
+    numbers = [
+        str(entry.number)
+        for entry in before.standing
+        if (touched := rows.get(type(entry.what))) and (moved & touched(entry.what)).any()
+    ]
     if numbers:
         raise SessionError(
             f"in frames that another animal gets, {session.path} has corrections of the present "

@@ -6,7 +6,7 @@ the active corrections. The log states the hashes of the tables it was made on a
 its own content. `Session.open` reads the corrected tables; `Session.open(path, raw=True)` reads the
 measured ones.
 
-Corrections of identity (`SHARED`) are in the logs of all animals of an arena. Their tables are
+Corrections of identity (`Roles`) are in the logs of all animals of an arena. Their tables are
 written to the folders `corrected.new` first; these are valid once every animal has one, so that the
 last rename is the commit (two-phase commit).
 """
@@ -168,54 +168,32 @@ class Description:
 
 
 @dataclass(frozen=True)
-class Swap:
-    """Exchange two animals of one arena in a span of frames.
+class Roles:
+    """State which of the animals of one arena is which in a span of frames.
 
     Attributes:
-        animals: the two, by their names in the column `individual`.
+        animals: the two that are exchanged, by their names in the column `individual`; none for a
+            crossing that is right as it is.
         start_frame: first frame, the camera's count.
         stop_frame: the first frame after the span.
         sessions: names of the folders of all animals of the arena, which have the same parent.
-        serial: number among the corrections of identity of this arena, from 1.
+        serial: number among these corrections in the arena, from 1.
     """
 
-    animals: tuple[str, str]
+    animals: tuple[str, ...]
     start_frame: int
     stop_frame: int
     sessions: tuple[str, ...]
     serial: int
-    kind: Literal["swap"] = "swap"
+    kind: Literal["roles"] = "roles"
 
     def __str__(self) -> str:
         """The sentence for a list of corrections."""
-        one, other = self.animals
-        return f"{one} and {other} exchanged in frames {self.start_frame} to {self.stop_frame - 1}"
+        said = f"{' and '.join(self.animals)} exchanged" if self.animals else "crossing is right"
+        return f"{said} in frames {self.start_frame} to {self.stop_frame - 1}"
 
 
-@dataclass(frozen=True)
-class CheckedCrossing:
-    """A crossing which the animals left in the roles that the tables state.
-
-    Attributes:
-        start_frame: its first frame, the camera's count.
-        stop_frame: the first frame after it.
-        sessions: as of `Swap`.
-        serial: as of `Swap`.
-    """
-
-    start_frame: int
-    stop_frame: int
-    sessions: tuple[str, ...]
-    serial: int
-    kind: Literal["crossing"] = "crossing"
-
-    def __str__(self) -> str:
-        """The sentence for a list of corrections."""
-        return f"crossing in frames {self.start_frame} to {self.stop_frame - 1} is right"
-
-
-SHARED = (Swap, CheckedCrossing)  # by all animals of an arena
-Correction = FlipSpan | JointMove | BoutEdit | Description | ClockFit | Swap | CheckedCrossing
+Correction = FlipSpan | JointMove | BoutEdit | Description | ClockFit | Roles
 _CORRECTION: TypeAdapter[Correction] = TypeAdapter(
     Annotated[Correction, Field(discriminator="kind")]
 )
@@ -324,7 +302,7 @@ class Log:
     @property
     def shared(self) -> tuple[LogEntry, ...]:
         """The active corrections of identity, which the logs of all animals of an arena have."""
-        found = [one for one in self.standing if isinstance(one.what, SHARED)]
+        found = [one for one in self.standing if isinstance(one.what, Roles)]
         return tuple(sorted(found, key=lambda one: one.what.serial))  # type: ignore[union-attr]
 
     def beside(self, session: Path) -> list[Path]:
@@ -333,7 +311,7 @@ class Log:
         Args:
             session: its folder.
         """
-        whats = [one.what for one in self.entries if isinstance(one.what, SHARED)]
+        whats = [one.what for one in self.entries if isinstance(one.what, Roles)]
         names = dict.fromkeys(Path(name).name for what in whats for name in what.sessions)
         return [session.parent / name for name in names]
 
@@ -386,7 +364,7 @@ class Log:
         undos = {entry.number for entry in self.entries if entry.what is None}
         redone = any(entry.undoes in undos for entry in self.entries)
         clocked = any(isinstance(entry.what, ClockFit) for entry in self.entries)
-        identified = any(isinstance(entry.what, SHARED) for entry in self.entries)
+        identified = any(isinstance(entry.what, Roles) for entry in self.entries)
         document = {
             # readable by earlier versions
             "schema_version": SCHEMA_VERSION

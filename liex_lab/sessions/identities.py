@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError, refuse
 from liex_lab.runtime.text_files import loose_json
 from liex_lab.sessions import evidence
-from liex_lab.sessions.corrections import CheckedCrossing, LogEntry, Swap, read_log
+from liex_lab.sessions.corrections import LogEntry, Roles, read_log
 from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import frame_count, rows_between
 from liex_lab.tracking.curve import track_whole
@@ -65,7 +65,7 @@ def arena_sessions(session: Session) -> dict[str, Session]:
 
 def swap(
     session: Session, other: Session | str, start_s: float, stop_s: float | None = None
-) -> Swap:
+) -> Roles:
     """Correction that exchanges two animals of one arena in a span of time.
 
     Args:
@@ -119,10 +119,10 @@ def swap(
     )
     count = frame_count(session.frames["frame_index"].to_numpy(np.int64))
     first, last = (int(count[row]) for row in rows)
-    return Swap((names[0], names[1]), first, last, *_shared_by(members))
+    return Roles((names[0], names[1]), first, last, *_shared_by(members))
 
 
-def check_crossing(session: Session, at_s: float) -> CheckedCrossing:
+def check_crossing(session: Session, at_s: float) -> Roles:
     """Correction that confirms the roles in which the animals leave a crossing.
 
     Args:
@@ -130,20 +130,18 @@ def check_crossing(session: Session, at_s: float) -> CheckedCrossing:
         at_s: a time in the crossing, s since the first frame.
 
     Raises:
-        SessionError: there is no crossing at this time; the message names the nearest one.
+        SessionError: there is no crossing at this time; the message lists them.
     """
     members = arena_sessions(session)
     table = session.crossings
     inside = table[(table["start_s"] <= at_s) & (at_s <= table["stop_s"])]
     if not len(inside):
-        off = (table["start_s"] - at_s).clip(lower=at_s - table["stop_s"])
-        near = [
-            f"the nearest one is from {one.start_s:.3f} to {one.stop_s:.3f} s"
-            for one in table.loc[off.sort_values().index[:1]].itertuples()
-        ]
-        raise SessionError(f"no crossing holds {at_s:g} s; {' '.join(near) or 'there is none'}")
+        begin = ", ".join(f"{one:.3f}" for one in table["start_s"][:10]) or "none"
+        raise SessionError(
+            f"no crossing of {session.path} holds {at_s:g} s; crossings begin at {begin} (s)"
+        )
     first, last = (int(inside[f"{end}_frame"].iloc[0]) for end in ("start", "stop"))
-    return CheckedCrossing(first, last, *_shared_by(members))
+    return Roles((), first, last, *_shared_by(members))
 
 
 def one_sided(session: Session) -> list[str]:
@@ -170,10 +168,11 @@ def shown(entries: Sequence[LogEntry], names: Sequence[str], index: Slots) -> Sl
         index: (n,) the camera's frame count.
     """
     found = np.tile(np.arange(len(names)), (len(index), 1))
-    for swapped in (one.what for one in entries if isinstance(one.what, Swap)):
-        rows = np.flatnonzero((swapped.start_frame <= index) & (index < swapped.stop_frame))
-        a, b = (names.index(name) for name in swapped.animals)
-        found[rows, a], found[rows, b] = found[rows, b], found[rows, a]
+    for one in (entry.what for entry in entries if isinstance(entry.what, Roles)):
+        if one.animals:
+            rows = np.flatnonzero((one.start_frame <= index) & (index < one.stop_frame))
+            a, b = (names.index(name) for name in one.animals)
+            found[rows, a], found[rows, b] = found[rows, b], found[rows, a]
     return found
 
 
@@ -226,12 +225,10 @@ def _reviewed(
     count = frame_count(index)
     span = int(count[crossing.start]), int(count[crossing.stop])
     for one in entries:
-        if isinstance(one.what, CheckedCrossing):
-            said = (one.what.start_frame, one.what.stop_frame) == span
-        else:
-            assert isinstance(one.what, Swap)
-            ends = {one.what.start_frame, one.what.stop_frame} - {int(count[0]), int(count[-1])}
-            said = any(span[0] <= end <= span[1] for end in ends)
+        assert isinstance(one.what, Roles)
+        ends = (one.what.start_frame, one.what.stop_frame)
+        inner = {*ends} - {int(count[0]), int(count[-1])}
+        said = any(span[0] <= end <= span[1] for end in inner) if one.what.animals else ends == span
         if said:
             crossing = replace(
                 crossing,

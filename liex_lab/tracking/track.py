@@ -249,7 +249,7 @@ class Crossing:
         stop: frame after the last.
         animals: which of them, from 0.
         p_swap: probability that they leave it in other roles than in the tracks.
-        decided_by: what decided it: motion or size, or human.
+        decided_by: what decided it: motion, size or rfid, or human.
         reviewed_by: the person who reviewed it; "" if nobody did.
         reviewed_at: when, ISO 8601.
     """

@@ -19,7 +19,7 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
 from liex_lab.sessions import Session, SessionWriter, correcting, identities
-from liex_lab.sessions.corrections import LogEntry, Swap, read_log, read_verdict
+from liex_lab.sessions.corrections import LogEntry, Roles, read_log, read_verdict
 from liex_lab.sessions.verdict import Verdict
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.identity import doubt, flag_unclear
@@ -159,7 +159,7 @@ def test_a_crossing_that_was_checked_is_certain_in_both(
         assert (was.frames["flag"][60:75] == "doubtful").all()
         assert one.path in reports
         assert (one.frames["flag"] == "").all()
-    with pytest.raises(SessionError, match=r"holds 7 s; the nearest one is from 2.000 to 2.500 s"):
+    with pytest.raises(SessionError, match=r"holds 7 s; crossings begin at 2.000"):
         correcting.parse_correction(opened(pair)[0], "crossing 7")
 
 
@@ -261,7 +261,7 @@ def test_exchanges_of_several_animals_compose_in_their_order() -> None:
     for serial in range(8):
         a, b = rng.choice(3, 2, replace=False)
         start, stop = np.sort(rng.integers(0, 30, 2))
-        swaps.append(Swap((names[a], names[b]), int(start), int(stop) + 1, (), serial))
+        swaps.append(Roles((names[a], names[b]), int(start), int(stop) + 1, (), serial))
         for frame, order in zip(index, wanted, strict=True):
             if start <= frame <= stop:
                 order[a], order[b] = order[b], order[a]
