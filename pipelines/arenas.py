@@ -34,8 +34,9 @@ from liex_lab.scene.zones import masks_apart
 from liex_lab.tracking.identity import identify, own_observations
 from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.observations import Observations
+from liex_lab.tracking.rfid import Readings, read_readings
 
-from .build import arenas_of, build_joint_tracker, build_recording, stated_corners
+from .build import arenas_of, build_arena, build_joint_tracker, build_recording, stated_corners
 from .choice import USUAL, fit_plan
 from .compiling import compile_ahead
 from .session import (
@@ -213,6 +214,11 @@ def _run_animals(
         going: dict[str, Prepared] = {}
         if count > 1:
             joint = build_joint_tracker(fitted.recording, fitted.plan, fitted.tracker, count)
+            rfid, readings = fitted.plan.animal.rfid, None
+            if rfid is not None:
+                arena, _ = build_arena(fitted.tracker.scene, fitted.plan)
+                last_s = 1e-9 * float(opened.times_ns[-1] - opened.times_ns[0])
+                readings = read_readings(rfid, last_s, count, arena)
             name = fitted.plan.session.name or opened.name
             folders = [durable.inside(out, f"{name}-animal{k + 1}", ".liex") for k in range(count)]
             for folder in folders:
@@ -224,9 +230,11 @@ def _run_animals(
                 ]
                 own = replace(fitted, plan=fitted.plan.with_settings(stated), tracker=tracker)
                 going[f"animal{k}"] = prepare(own, folder, started, progress)
-            sessions = _measure_animals(going, joint, recording, overwrite, notes, report, progress)
+            sessions = _measure_animals(
+                going, joint, readings, recording, overwrite, notes, report, progress
+            )
             return [ArenaOutcome(name, session) for name, session in sessions.items()]
-    alone = ["animal.count=1"]
+    alone = ["animal.rfid=", "animal.count=1"]
     session = run_session(
         recording,
         plan and plan.with_settings(alone),
@@ -243,6 +251,7 @@ def _run_animals(
 def _measure_animals(
     going: Mapping[str, Prepared],
     joint: JointTracker,
+    readings: Readings | None,
     recording: str | Path | Recording,
     overwrite: bool,
     notes: Mapping[str, Any] | None,
@@ -265,8 +274,10 @@ def _measure_animals(
         whole = [writer.observations(Observations) for writer in writers]
         subjects = [prepared.fitted.tracker.subject for prepared in going.values()]
         areas = [prepared.fitted.tracker.scene.area_mm2 for prepared in going.values()]
-        identity = identify(whole, subjects, areas)
+        identity = identify(whole, subjects, areas, readings)
         for k, (prepared, writer) in enumerate(zip(going.values(), writers, strict=True)):
+            if readings is not None:
+                prepared.mark(writer, identity, k)
             crossings = [one for one in identity.crossings if k in one.animals]
             prepared.follow(writer, own_observations(whole[k], identity.slots[:, k]), crossings)
         together = None

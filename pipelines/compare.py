@@ -31,8 +31,9 @@ from liex_lab.plan.study import Study, same
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, evidence
+from liex_lab.sessions.corrections import read_verdict
 from liex_lab.sessions.folder import FAILED_FILE, read_failure
-from liex_lab.sessions.verdict import NEEDS_REVIEW, OTHER_ANIMAL, Entry, read_verdict
+from liex_lab.sessions.verdict import NEEDS_REVIEW, OTHER_ANIMAL, Entry
 from liex_lab.tables.schema import dictionary, from_pandas, write_table
 
 from .study.status import misnamed

@@ -7,7 +7,8 @@ replaces the folder as a whole, and its predecessor is removed only once the new
 
 import json
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -20,6 +21,8 @@ from liex_lab.dashboards.report.report import write_views
 from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
+from liex_lab.behaviour.interactions import TABLES as INTERACTION_TABLES
+from liex_lab.behaviour.interactions import Individual, Interactions, find_interactions
 from liex_lab.behaviour.summary import Behaviour, measure_rows, stated_by
 from liex_lab.body.pose import Pose, fit_poses
 from liex_lab.body.skeleton import Skeleton
@@ -29,18 +32,20 @@ from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
 from liex_lab.runtime import durable
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions import Session, correcting, corrections, evidence, rrd
+from liex_lab.sessions import Session, correcting, corrections, evidence, identities, rrd
 from liex_lab.sessions.clock import fingerprint
 from liex_lab.sessions.folder import file_facts
 from liex_lab.sessions.provenance import reading_from
+from liex_lab.sessions.verdict import Verdict
 from liex_lab.tables import schema
 from liex_lab.tables.rows import Rows, frame_count
-from liex_lab.tracking import curve, observations, smoother
-from liex_lab.tracking.track import CORRECTED, Flip, Track, ends_of
+from liex_lab.tracking import curve, identity, observations, smoother
+from liex_lab.tracking.track import CORRECTED, Crossing, Flip, Subject, Track, ends_of
 
 from .session import measure_behaviour
 
 _BEFORE = "The tables of interactions are those of the poses before their correction."
+_PART = f"{corrections.FOLDER}.part"
 
 Numbers = NDArray[np.int64]  # of rows
 
@@ -75,46 +80,166 @@ def correct_session(
         SessionError: a correction cannot be applied, or another program is correcting the session.
     """
     raw = Session.open(session, raw=True)
-    with durable.locked(
-        raw.path / ".correcting", f"{raw.path} is being corrected by another program"
-    ):
-        folder = durable.unlinked_tree(raw.path / corrections.FOLDER)
-        aside = durable.unlinked(raw.path / f"{corrections.FOLDER}.old")
-        durable.put_back(folder, aside)  # a process may have been killed here
-        made_of = corrections.basis(raw.path, raw.metadata)
-        log = corrections.read_log(raw.path)
-        if log.touched and log.made_of != made_of and (what or undo):
-            raise SessionError(
-                f"the corrections of {raw.path} were made on another measurement of this "
-                "recording; list them with `liex correct list`, then apply them with `liex "
-                f"correct apply`, or remove the folder {corrections.FOLDER}"
-            )
-        log = replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
+    with ExitStack() as held:
+        log = _noted(raw, what, undo, author, held)
         if not log.entries:
             raise SessionError(
                 f"{raw.path} has no corrections to apply; `liex correct --help` explains how to "
                 "make one"
             )
-        part = durable.unlinked(raw.path / f"{corrections.FOLDER}.part")
+        before = corrections.read_log(raw.path)
+        members = identities.arena_sessions(raw) if log.shared or before.shared else {}
+        logs = {raw.metadata["individual"]: log}
+        if log.shared != before.shared or not (what or undo):
+            logs = {
+                name: logs.get(name) or _noted_like(log, other, author, held)
+                for name, other in members.items()
+            } or logs
+        sessions = {name: members.get(name, raw) for name in logs}
+        try:
+            _write(sessions, logs, members, progress)
+        finally:
+            for one in sessions.values():
+                shutil.rmtree(one.path / _PART, ignore_errors=True)
+    for one in sessions.values():
+        if report or one.path != raw.path:  # the own one waits for the last correction
+            progress(0, None, "writing the report")
+            write_views(one.path)
+    return raw.path
+
+
+def _noted(
+    raw: Session,
+    what: Sequence[corrections.Correction],
+    undo: Sequence[int],
+    author: str,
+    held: ExitStack,
+) -> corrections.Log:
+    """The log of a session with further entries; the session is locked until `held` closes."""
+    held.enter_context(
+        durable.locked(
+            raw.path / ".correcting", f"{raw.path} is being corrected by another program"
+        )
+    )
+    folder = durable.unlinked_tree(raw.path / corrections.FOLDER)
+    aside = durable.unlinked(raw.path / f"{corrections.FOLDER}.old")
+    new = durable.unlinked(raw.path / corrections.NEW)
+    if corrections.corrected_folder(raw.path) == new:  # a process was killed after the commit
+        durable.move_into_place(new, folder, aside)
+    durable.discard(new)
+    durable.put_back(folder, aside)  # a process may have been killed here
+    made_of = corrections.basis(raw.path, raw.metadata)
+    log = corrections.read_log(raw.path)
+    if log.touched and log.made_of != made_of and (what or undo):
+        raise SessionError(
+            f"the corrections of {raw.path} were made on another measurement of this "
+            "recording; list them with `liex correct list`, then apply them with `liex "
+            f"correct apply`, or remove the folder {corrections.FOLDER}"
+        )
+    return replace(log.added(what, undo, author), made_of=made_of, files={}, facts={})
+
+
+def _noted_like(
+    log: corrections.Log, other: Session, author: str, held: ExitStack
+) -> corrections.Log:
+    """The log of another animal with the same corrections of identity; it is locked as well."""
+    wanted = [entry.what for entry in log.shared]
+    theirs = corrections.read_log(other.path).shared
+    known = [entry.what for entry in theirs]
+    missing = [one for one in wanted if one is not None and one not in known]
+    undo = [entry.number for entry in theirs if entry.what not in wanted]
+    return _noted(other, missing, undo, author, held)
+
+
+def _write(
+    sessions: Mapping[str, Session],
+    logs: Mapping[str, corrections.Log],
+    members: Mapping[str, Session],
+    progress: Progress,
+) -> None:
+    """Write the corrected folders of one session, or of all animals of an arena at once.
+
+    Args:
+        sessions: those whose folders are written, opened raw, by the animals' names.
+        logs: their logs.
+        members: all animals of the arena; empty if no identity was ever corrected.
+        progress: receives progress reports.
+    """
+    found: dict[str, CorrectedTrack] = {}
+    for name, log in logs.items():
+        if members:
+            _refuse_moved(sessions[name], log, [*members])
+        if log.touched:
+            progress(0, None, "measuring what was corrected")
+            skeleton = evidence.skeleton_of(sessions[name])
+            found[name] = corrected_track(sessions[name], log, skeleton, members)
+    together = _together(members, found) if len(found) > 1 else None
+    for name, log in logs.items():
+        one = sessions[name]
+        part = durable.unlinked(one.path / _PART)
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
-        try:
-            if log.touched:
-                progress(0, None, "measuring what was corrected")
-                log = _apply(raw, log, part)
-            if log.described:
-                _describe(raw, log, part)
-            if log.clock:
-                log = _synchronise(raw, log, part)
-            log = replace(log, files=file_facts(part))
-            (part / corrections.LOG).write_text(log.to_json(), encoding="utf-8")
-            durable.move_into_place(part, folder, aside)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-    if report:
-        progress(0, None, "writing the report")
-        write_views(raw.path)
-    return raw.path
+        if log.touched:
+            log = _apply(one, log, part, found[name], together)
+        if log.described:
+            _describe(one, log, part)
+        if log.clock:
+            log = _synchronise(one, log, part)
+        log = replace(log, files=file_facts(part))
+        (part / corrections.LOG).write_text(log.to_json(), encoding="utf-8")
+        durable.sync_tree(part)
+    for one in sessions.values():  # valid when all of them are renamed
+        (one.path / _PART).rename(one.path / corrections.NEW)
+        durable.sync_folder(one.path)
+    for one in sessions.values():
+        folder = one.path / corrections.FOLDER
+        aside = one.path / f"{corrections.FOLDER}.old"
+        durable.move_into_place(one.path / corrections.NEW, folder, aside)
+
+
+def _refuse_moved(session: Session, log: corrections.Log, names: Sequence[str]) -> None:
+    """Refuse to give frames to another animal of which something else was corrected before.
+
+    Raises:
+        SessionError: there are such corrections; the message names their numbers.
+    """
+    before = corrections.read_log(session.path)
+    index, times = (session.frames[name].to_numpy() for name in ("frame_index", "time_ns"))
+    own = names.index(session.metadata["individual"])
+    was, now = (identities.shown(one.shared, names, index)[:, own] for one in (before, log))
+
+    moved = was != now
+    rows: dict[type, Callable[[Any], NDArray[np.bool_]]] = {
+        corrections.FlipSpan: lambda one: (one.start_frame <= index) & (index < one.stop_frame),
+        corrections.JointMove: lambda one: index == one.frame,
+        corrections.BoutEdit: lambda one: (one.start_ns <= times) & (times < one.stop_ns),
+    }
+    numbers = [
+        str(entry.number)
+        for entry in before.standing
+        if (touched := rows.get(type(entry.what))) and (moved & touched(entry.what)).any()
+    ]
+    if numbers:
+        raise SessionError(
+            f"in frames that another animal gets, {session.path} has corrections of the present "
+            f"one ({', '.join(numbers)} in `liex correct list`); undo these, and make them again "
+            "where they belong afterwards"
+        )
+
+
+def _together(
+    members: Mapping[str, Session], found: Mapping[str, "CorrectedTrack"]
+) -> Interactions | None:
+    """The interactions of the corrected tracks; None without a table of them."""
+    raw = next(iter(members.values()))
+    if not raw.has("interactions.parquet"):
+        return None
+    return find_interactions(
+        raw.frames["time_s"].to_numpy(float),
+        [Individual.of_track(name, one.track) for name, one in found.items()],
+        Plan.from_toml(raw.plan, "plan.toml").interactions,
+        raw.frames["frame_index"].to_numpy(np.int64),
+    )
 
 
 def describe_session(
@@ -147,39 +272,73 @@ def describe_session(
     )
 
 
-def _apply(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
+def _apply(
+    raw: Session,
+    log: corrections.Log,
+    folder: Path,
+    found: "CorrectedTrack",
+    together: Interactions | None,
+) -> corrections.Log:
     """Write the tables that differ from the session's, and a replay to overlay on the session's.
 
     Returns the log that lists them.
     """
-    skeleton = evidence.skeleton_of(raw)
-    origin = evidence.provenance_of(raw, skeleton)
-    found = corrected_track(raw, log, skeleton)
+    origin = evidence.provenance_of(raw, found.track.skeleton)
     index = raw.frames["frame_index"].to_numpy()
     rows = Rows(
         found.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
     )
-    results = evidence.Results(origin, rows, found.flips)
+    results = evidence.Results(origin, rows, found.flips, found.crossings)
     behaviour, facts = _behaviour(raw, log, found, results)
     written = behaviour.tables
-    together = schema.INTERACTIONS if raw.has("interactions.parquet") else ()
-    if len(found.turned) or len(found.moved):
+    problems = [*raw.metadata["problems"], *found.remarks]
+    if together is not None:
+        written = {**written, **together.for_session(raw.name)["results"]}
+    elif log.shared:  # as they were when identities were corrected last
+        for name in INTERACTION_TABLES:
+            shutil.copy2(Session.open(raw.path).file(f"{name}.parquet"), folder)
+    if log.shared or len(found.turned) or len(found.moved):
         results.write_track(folder)
         facts["frames"] = results.counts()
-        if together:
-            facts["problems"] = [*raw.metadata["problems"], _BEFORE]
+        measured = (corrections.FlipSpan, corrections.JointMove)
+        has_before = together is None and raw.has("interactions.parquet")
+        if has_before and any(isinstance(one.what, measured) for one in log.standing):
+            problems.append(_BEFORE)
     else:
         # tables that bout edits do not change
         written = {
             name: table for name, table in written.items() if name not in ("kinematics", "zones")
         }
-    results.write_measured(folder, written, (*behaviour.vocabulary.columns, *together))
+    more = schema.INTERACTIONS if raw.has("interactions.parquet") else ()
+    results.write_measured(folder, written, (*behaviour.vocabulary.columns, *more))
     facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}
+    if problems != raw.metadata["problems"]:
+        facts["problems"] = problems
+    if log.shared and "verdict" in raw.metadata:
+        facts["verdict"] = _verdict(raw, found)
     layout = replay_blueprint({**raw.metadata, **facts})
     rrd.ReplayWriter(folder / corrections.REPLAY, origin, layout, corrected=True).finish(
         rows, behaviour.kinematics, behaviour.bouts, list(behaviour.actions), ()
     )
     return replace(log, facts=facts)
+
+
+def _verdict(raw: Session, found: "CorrectedTrack") -> dict[str, Any]:
+    """The verdict on a session whose identities were corrected, for session.json."""
+    stated, track = raw.metadata["verdict"], found.track
+    doubts = [identity.doubt(one or ()) for one in (evidence.read_crossings(raw), found.crossings)]
+    errors = track.predicted_error_mm[track.observed]
+    names = {one.name for one in fields(Verdict)}
+    return replace(
+        Verdict(**{name: value for name, value in stated.items() if name in names}),
+        n_posed=int(track.observed.sum()),
+        n_trusted=int((track.observed & (track.flag == "")).sum()),
+        expected_error_mm=float(np.median(errors)) if len(errors) else None,
+        reasons=(
+            *(one for one in stated["reasons"] if one != doubts[0]),
+            *filter(None, doubts[1:]),
+        ),
+    ).to_dict()
 
 
 def _describe(raw: Session, log: corrections.Log, folder: Path) -> None:
@@ -249,6 +408,7 @@ def _summary(log: corrections.Log) -> dict[str, Any]:
     return {
         "n": len(made),
         **{kind: sum(what.kind == kind for what, _ in made) for kind in ("flip", "joint", "bout")},
+        **({"swap": len(log.shared)} if log.shared else {}),
         "authors": sorted({author for _, author in made}),
         "last": log.touched[-1].made_at,
     }
@@ -290,24 +450,34 @@ class CorrectedTrack:
 
     Attributes:
         track: the corrected track.
-        turned: (k,) rows whose pose may have changed by exchanging head and tail.
+        turned: (k,) rows whose pose may have changed by exchanging head and tail, or animals.
         moved: (m,) rows with manually placed joints.
         flips: the rows of the table `flips`, frames counted by row.
+        crossings: those with other animals; None if it was measured alone.
+        remarks: further sentences for the session's problems.
     """
 
     track: Track
     turned: Numbers
     moved: Numbers
     flips: tuple[Flip, ...]
+    crossings: tuple[Crossing, ...] | None = None
+    remarks: tuple[str, ...] = ()
 
 
-def corrected_track(session: Session, log: corrections.Log, skeleton: Skeleton) -> CorrectedTrack:
+def corrected_track(
+    session: Session,
+    log: corrections.Log,
+    skeleton: Skeleton,
+    members: Mapping[str, Session] | None = None,
+) -> CorrectedTrack:
     """Track of a session with the active corrections of its log.
 
     Args:
         session: the session, opened raw.
         log: its corrections; bout edits are ignored here.
         skeleton: the skeleton that the session was made with.
+        members: the sessions of all animals of its arena, if identities were corrected.
 
     Raises:
         SessionError: the session has no observations to rebuild the track from, or a joint was
@@ -317,18 +487,31 @@ def corrected_track(session: Session, log: corrections.Log, skeleton: Skeleton) 
     index = session.frames["frame_index"].to_numpy(np.int64)
     flips = tuple(evidence.read_flips(session))
     turned = np.zeros(0, np.int64)
+    crossings = evidence.read_crossings(session)
     spans: list[corrections.FlipSpan] = log.corrections(corrections.FlipSpan)
+    remarks: list[str] = []
+    if log.shared:
+        was = track
+        observed, subject, tracked, remarks = identities.exchanged(
+            session, members or {}, log.shared
+        )
+        track, flips, crossings = tracked.track, tracked.flips, tracked.crossings
+        same = (was.joints_mm == track.joints_mm) | np.isnan(was.joints_mm + track.joints_mm)
+        turned = np.flatnonzero(~same.all(axis=(1, 2)) | (was.flag != track.flag))
+    elif spans:
+        observed, subject = evidence.read_evidence(session)
     if spans:
-        track, flips, turned = _turned_round(session, track, index, spans)
+        track, flips, rows = _turned_round(session, track, index, spans, observed, subject)
+        turned = np.union1d(turned, rows)
     moves = _moves_of(log, skeleton)
-    was = deepcopy(track.pose)
+    unmoved = deepcopy(track.pose)
     moved = place_joints(track, index, moves, session.camera, session.T_arena_camera)
     if len(moved):
-        followed = smoother.let_follow(track, was, moved)
+        followed = smoother.let_follow(track, unmoved, moved)
         track.uv_px[followed] = session.camera.project(
             session.T_arena_camera.inverse() @ track.joints_mm[followed]
         )
-    return CorrectedTrack(track, turned, moved, flips)
+    return CorrectedTrack(track, turned, moved, flips, crossings, tuple(remarks))
 
 
 def _moves_of(log: corrections.Log, skeleton: Skeleton) -> list[corrections.JointMove]:
@@ -349,7 +532,12 @@ def _moves_of(log: corrections.Log, skeleton: Skeleton) -> list[corrections.Join
 
 
 def _turned_round(
-    session: Session, track: Track, index: Numbers, spans: Sequence[corrections.FlipSpan]
+    session: Session,
+    track: Track,
+    index: Numbers,
+    spans: Sequence[corrections.FlipSpan],
+    observed: observations.Observations,
+    subject: Subject,
 ) -> tuple[Track, tuple[Flip, ...], Numbers]:
     """Rebuild the track from the observations with head and tail exchanged in the spans.
 
@@ -357,7 +545,6 @@ def _turned_round(
     agrees with its neighbour: there the smoothed curve was bent by the half turn that is gone. No
     row loses its pose or its trust.
     """
-    observed, subject = evidence.read_evidence(session)
     rows_of_spans = (np.searchsorted(index, (one.start_frame, one.stop_frame)) for one in spans)
     wanted = [Flip(int(start), int(stop), 1.0, True, HUMAN) for start, stop in rows_of_spans]
     # from versions that wrote into the table

@@ -508,6 +508,21 @@ class Prepared:
         self.timings["track"] += time.perf_counter() - began
         writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
 
+    def mark(self, writer: SessionWriter, found: identity.Identity, animal: int) -> None:
+        """Name the animal by its RFID tag, if it is known, and note how the readings fit.
+
+        Args:
+            writer: the session's writer.
+            found: the identities of all animals of the arena.
+            animal: number of this one.
+        """
+        fitted = self.fitted
+        misfits, notes = (*fitted.misfits, *found.misfits), (*fitted.notes, *found.remarks)
+        self.fitted = replace(fitted, misfits=misfits, notes=notes)
+        if found.tags and found.tags[animal]:
+            writer.origin.subject["subject_id"] = found.tags[animal]
+            writer.note(subject={"subject_id": found.tags[animal]})
+
     def conclude(
         self,
         writer: SessionWriter,

@@ -53,7 +53,7 @@ _REST = _ALONG >= 0.45  # what touches when animals rest together
 _NECK, _CHEST = 3, 4  # places of a quarter and a third of the body
 _WALKERS = ("mount", "huddle")  # words that swimming animals do not have
 _BLOCK = 4096
-_TABLES = ("interactions", "interaction_totals")
+TABLES = ("interactions", "interaction_totals")
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Interactions:
 
     def for_session(self, session_id: str) -> dict[str, Any]:
         """Tables, descriptions of their columns and notes, as `SessionWriter.close` takes them."""
-        tables = zip(_TABLES, (self.events, self.totals), strict=True)
+        tables = zip(TABLES, (self.events, self.totals), strict=True)
         about = {
             "individuals": list(self.names),
             "limits": self.limits.model_dump(),

@@ -123,6 +123,35 @@ def bout(
             )
 
 
+@correct.command()
+def swap(
+    session: SessionPath,
+    other: Annotated[Path, typer.Argument(help="Session of the other animal.")],
+    start_s: Annotated[
+        float, typer.Option("--from", metavar="S", help="Seconds since the first frame.")
+    ],
+    stop_s: Annotated[
+        float | None,
+        typer.Option("--to", metavar="S", help="Seconds, exclusive; default: the end."),
+    ] = None,
+    by: Author = "",
+) -> None:
+    """Exchange two animals of one recording in a time span, in both sessions."""
+    from liex_lab.sessions import identities
+
+    _do(session, [identities.swap(_opened(session), _opened(other), start_s, stop_s)], by)
+
+
+@correct.command()
+def crossing(
+    session: SessionPath,
+    at_s: Annotated[float, typer.Option("--at", metavar="S", help="A time within it, s.")],
+    by: Author = "",
+) -> None:
+    """Confirm that the animals are right after a crossing, in the sessions of all of them."""
+    _parse_and_apply(session, ["crossing", at_s], by)
+
+
 @correct.command("list")
 def list_corrections(session: SessionPath) -> None:
     """List all corrections with author, time and state."""
@@ -308,6 +337,7 @@ def _parse_and_apply(session: Path, sentence: Sequence[object], by: str) -> None
 
 def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] = ()) -> None:
     from liex_lab.sessions.correcting import disagreements
+    from liex_lab.sessions.corrections import read_log
 
     with progress_bar() as progress:
         api.correct_session(session, what, undo=undo, author=by, progress=progress)
@@ -317,5 +347,6 @@ def _do(session: Path, what: Sequence[Correction], by: str, undo: Sequence[int] 
         echo(f"note:      {sentence}")
     if len(what) > 5:
         echo(f"corrected: {len(what) - 5} further bouts")
-    echo(f"tables:    {session / 'corrected'}")
-    echo(f"report:    {session / 'report.html'}")
+    for path in read_log(session).beside(session) or [session]:
+        echo(f"tables:    {path / 'corrected'}")
+        echo(f"report:    {path / 'report.html'}")

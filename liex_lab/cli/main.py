@@ -429,8 +429,8 @@ def _fault(error: Exception) -> NoReturn:
 
 def _print_session(session: Path, further: str = "") -> int:
     """Print a session's path and result; returns the exit code, 4 if it needs review."""
+    from liex_lab.sessions.corrections import read_verdict
     from liex_lab.sessions.folder import folder_bytes, megabytes, taken_from
-    from liex_lab.sessions.verdict import read_verdict
 
     echo(f"session: {session}")
     if copy := taken_from(session):

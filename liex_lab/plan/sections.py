@@ -134,6 +134,30 @@ class SharedBody(SettingsTable):
         return f"{self.n_sessions} sessions of {self.subject}"
 
 
+class Circle(SettingsTable):
+    """A circle: its centre [x, y] and its radius."""
+
+    centre: Corner
+    radius: Positive
+
+
+class Rfid(SettingsTable):
+    """RFID readings that tell the animals of one arena apart."""
+
+    readings: str = Field(
+        description=(
+            "path of a CSV file with the columns time_s (s since the first frame), antenna and id"
+        )
+    )
+    tags: list[str] = Field(
+        min_length=1, description="ids of the animals' tags; they become their subject_id"
+    )
+    antennas: dict[ArenaName, Circle] = Field(
+        description="centre and range of each antenna by its name, mm on the floor, as of a region"
+    )
+    offset_s: float = Field(0.0, description="is added to the times of the readings")
+
+
 class AnimalSettings(SettingsTable):
     """[animal]: the animal and its skeleton."""
 
@@ -156,6 +180,13 @@ class AnimalSettings(SettingsTable):
             "'auto' counts them"
         ),
     )
+    rfid: Rfid | None = Field(
+        None,
+        description=(
+            "RFID readings that tell several animals apart: {readings = 'FILE.csv', tags = [...], "
+            "antennas = {NAME = {centre = [x, y], radius = r}}}; see docs/howto/rfid.md"
+        ),
+    )
     shared: SharedBody | None = Field(
         None,
         description=(
@@ -163,6 +194,15 @@ class AnimalSettings(SettingsTable):
             "= 'subject'; not set: the session's own"
         ),
     )
+
+    @model_validator(mode="after")
+    def _of_several(self) -> Self:
+        if self.rfid is not None and self.count == 1:
+            raise ValueError(
+                "[animal.rfid] tells several animals apart, and count is 1; state how many are in "
+                "the arena, or 'auto'"
+            )
+        return self
 
 
 class CameraOverride(SettingsTable):
@@ -246,13 +286,6 @@ class StatedFloor(SettingsTable):
 
     point: Point
     normal: Point
-
-
-class Circle(SettingsTable):
-    """A circle: its centre [x, y] and its radius."""
-
-    centre: Corner
-    radius: Positive
 
 
 class Region(SettingsTable):

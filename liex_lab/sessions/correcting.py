@@ -19,6 +19,7 @@ from liex_lab.actions.labels import sessions_named, words_of
 from liex_lab.errors import LiexError, SessionError, refuse
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
+from liex_lab.sessions import identities
 from liex_lab.sessions.corrections import (
     DESCRIBED,
     BoutEdit,
@@ -29,11 +30,10 @@ from liex_lab.sessions.corrections import (
 )
 from liex_lab.sessions.cutouts import Kept, open_depth
 from liex_lab.sessions.session import Session
-from liex_lab.tables.rows import frame_count, stop_times
+from liex_lab.tables.rows import ROUNDED_S, frame_count, rows_between, stop_times
 
 Array = NDArray[np.float64]
 
-_ROUNDED_S = 5e-4  # times are typed with three decimals
 _WORD_LENGTH = 60
 # shares of the animal's length: its least distance in front of the still scene, and its largest
 # from the nearest joint (half of that if the scene is unknown and the floor is used instead)
@@ -46,6 +46,8 @@ SENTENCES = (  # seconds since the first frame; a pixel u v, or a position x y z
     "recut AT FROM TO",
     "delete AT",
     "add ACTION FROM TO",
+    "swap ANIMAL FROM [TO]",
+    "crossing AT",
 )
 OFF_THE_ANIMAL = "height kept: the pixel is not on the animal"
 
@@ -87,6 +89,10 @@ def parse_correction(
                 return recut_bout(session, *numbers(at, start, stop))
             case ["delete", at]:
                 return delete_bout(session, *numbers(at))
+            case ["swap", name, start, *stop] if len(stop) < 2:
+                return identities.swap(session, str(name), *numbers(start, *stop))
+            case ["crossing", at]:
+                return identities.check_crossing(session, *numbers(at))
             case ["flip", start, stop]:
                 return flip_span(session, *numbers(start, stop))
             case ["joint", name, row, u, v]:
@@ -110,7 +116,7 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
         SessionError: the span has no frame, or none with a pose, or the skeleton is not a chain of
             joints with a head and a tail.
     """
-    first, last = rows_between(session, start_s, stop_s, "a span to flip")
+    first, last = rows_between(_times(session), start_s, stop_s, "a span to flip")
     refuse(
         SessionError,
         (
@@ -129,7 +135,7 @@ def flip_span(session: Session, start_s: float, stop_s: float) -> FlipSpan:
 
 
 def disagreements(session: Session) -> list[str]:
-    """Exchanges of head and tail that contradict the frames around them, in sentences.
+    """Exchanges that contradict the frames around them or another session, in sentences.
 
     At an end of such an exchange the body turns by more than 90 degrees from one frame with a pose
     to the next. The nearest consistent span begins and ends where the body makes such a turn
@@ -140,13 +146,15 @@ def disagreements(session: Session) -> list[str]:
         session: the session with its corrections.
 
     Returns:
-        One sentence for each active exchange that disagrees, with the commands to change it.
+        One sentence for each active exchange of head and tail that disagrees, with the commands to
+        change it, and for each session beside this one whose animals are exchanged otherwise.
     """
     exchanges = [
         (one.number, one.what) for one in session.log.standing if isinstance(one.what, FlipSpan)
     ]
+    found = identities.one_sided(session)
     if not exchanges:
-        return []
+        return found
     index, time_s = (session.frames[name].to_numpy() for name in ("frame_index", "time_s"))
     ahead = _ahead(session)
     rows = np.flatnonzero(np.isfinite(ahead).all(axis=1))
@@ -157,7 +165,6 @@ def disagreements(session: Session) -> list[str]:
     half_turns = set(np.flatnonzero(cosine < 0.0).tolist()) - apart
     ends_s = np.append(time_s, stop_times(time_s)[-1:])
     path = shlex.quote(str(session.path))
-    found = []
     for number, flip in exchanges:
         # the first row with a pose from each end
         ends = np.searchsorted(rows, np.searchsorted(index, (flip.start_frame, flip.stop_frame)))
@@ -179,6 +186,11 @@ def disagreements(session: Session) -> list[str]:
             f"{path} --from {ends_s[start]:.3f} --to {ends_s[stop]:.3f}`"
         )
     return found
+
+
+def _times(session: Session) -> Array:
+    """(n,) time of every frame, s since the first."""
+    return np.asarray(session.frames["time_s"], float)
 
 
 def _joints(session: Session) -> Array:
@@ -359,7 +371,7 @@ def bout_at(session: Session, at_s: float) -> dict[str, Any]:
         SessionError: there is no bout at this time; the message names the nearest ones.
     """
     bouts = session.bouts
-    inside = bouts[(bouts["start_s"] <= at_s + _ROUNDED_S) & (bouts["stop_s"] > at_s + _ROUNDED_S)]
+    inside = bouts[(bouts["start_s"] <= at_s + ROUNDED_S) & (bouts["stop_s"] > at_s + ROUNDED_S)]
     if len(inside) == 0:
         starts, stops = (bouts[name].to_numpy(float) for name in ("start_s", "stop_s"))
         distance = np.maximum(starts - at_s, at_s - stops)
@@ -482,28 +494,6 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
     return [*free, *(BoutEdit("add", bout.action, bout.start_ns, bout.stop_ns) for bout in bouts)]
 
 
-def rows_between(session: Session, start_s: float, stop_s: float, what: str) -> tuple[int, int]:
-    """First row of a span of time, and the first row after it.
-
-    Args:
-        session: the session.
-        start_s: start, s since the first frame.
-        stop_s: stop, s, exclusive.
-        what: name of the span, for the error message.
-
-    Raises:
-        SessionError: the span has no frame.
-    """
-    time_s = session.frames["time_s"].to_numpy()
-    first, last = (int(np.searchsorted(time_s, at - _ROUNDED_S)) for at in (start_s, stop_s))
-    if not (start_s < stop_s and first < last):
-        raise SessionError(
-            f"{what} is from a time to a later one, in seconds since the first frame, and holds a "
-            f"frame; got {start_s:g} to {stop_s:g} in a session of 0 to {time_s[-1]:.3f} s"
-        )
-    return first, last
-
-
 def span_ns(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:
     """Span of frames on the recording's clock, ns.
 
@@ -521,7 +511,7 @@ def span_ns(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:
     Raises:
         SessionError: the span has no frame.
     """
-    first, last = rows_between(session, start_s, stop_s, "a bout")
+    first, last = rows_between(_times(session), start_s, stop_s, "a bout")
     times = session.frames["time_ns"].to_numpy(np.int64)
     return int(times[first]), int(times[last]) if last < len(times) else _end_ns(session)
 

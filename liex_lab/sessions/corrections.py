@@ -1,16 +1,21 @@
-"""Append-only log of additions to a session: flips, joints, bouts, descriptions, a clock.
+"""Append-only log of additions to a session: flips, joints, bouts, animals, descriptions, a clock.
 
 The files of a session are never rewritten. Its folder `corrected` contains `corrections.json`, a
 log to which entries are only appended (an entry may undo another), and the tables that result from
 the active corrections. The log states the hashes of the tables it was made on and the SHA-256 of
 its own content. `Session.open` reads the corrected tables; `Session.open(path, raw=True)` reads the
 measured ones.
+
+Corrections of identity (`Roles`) are in the logs of all animals of an arena. Their tables are
+written to the folders `corrected.new` first; these are valid once every animal has one, so that the
+last rename is the commit (two-phase commit).
 """
 
 import getpass
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,13 +27,15 @@ from pydantic.dataclasses import dataclass
 from liex_lab.catalog import sha256
 from liex_lab.errors import SessionError, one_line, refuse
 from liex_lab.runtime.durable import safe_name
+from liex_lab.runtime.text_files import loose_json
 from liex_lab.sessions.clock import ClockFit
-from liex_lab.sessions.verdict import ALSO, SUBJECT
+from liex_lab.sessions.verdict import ALSO, SUBJECT, verdict_in
 
 FOLDER = "corrected"
+NEW = "corrected.new"
 LOG = "corrections.json"
 REPLAY = "corrected.rrd"
-SCHEMA_VERSION = 4  # 2: species and age are described; 3: redo; 4: clock
+SCHEMA_VERSION = 5  # 2: species and age are described; 3: redo; 4: clock; 5: identities
 FACTS = {
     "frames",
     "actions",
@@ -37,6 +44,8 @@ FACTS = {
     "refused_bouts",
     "corrections",
     "sync",
+    "problems",
+    "verdict",
 }  # sections that may change
 START = "session_start_time"
 DESCRIBED = (*SUBJECT, *ALSO, START)
@@ -158,7 +167,33 @@ class Description:
         return f"{self.key} is {self.value or 'not known'}"
 
 
-Correction = FlipSpan | JointMove | BoutEdit | Description | ClockFit
+@dataclass(frozen=True)
+class Roles:
+    """State which of the animals of one arena is which in a span of frames.
+
+    Attributes:
+        animals: the two that are exchanged, by their names in the column `individual`; none for a
+            crossing that is right as it is.
+        start_frame: first frame, the camera's count.
+        stop_frame: the first frame after the span.
+        sessions: names of the folders of all animals of the arena, which have the same parent.
+        serial: number among these corrections in the arena, from 1.
+    """
+
+    animals: tuple[str, ...]
+    start_frame: int
+    stop_frame: int
+    sessions: tuple[str, ...]
+    serial: int
+    kind: Literal["roles"] = "roles"
+
+    def __str__(self) -> str:
+        """The sentence for a list of corrections."""
+        said = f"{' and '.join(self.animals)} exchanged" if self.animals else "crossing is right"
+        return f"{said} in frames {self.start_frame} to {self.stop_frame - 1}"
+
+
+Correction = FlipSpan | JointMove | BoutEdit | Description | ClockFit | Roles
 _CORRECTION: TypeAdapter[Correction] = TypeAdapter(
     Annotated[Correction, Field(discriminator="kind")]
 )
@@ -221,7 +256,7 @@ class Log:
     made_of: str
     entries: tuple[LogEntry, ...] = ()
     files: dict[str, dict[str, Any]] = field(default_factory=dict)
-    facts: dict[str, dict[str, Any]] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         others = sorted(set(self.facts) - FACTS)
@@ -263,6 +298,22 @@ class Log:
     def corrections(self, kind: type[Any]) -> list[Any]:
         """The active corrections of one kind."""
         return [entry.what for entry in self.standing if isinstance(entry.what, kind)]
+
+    @property
+    def shared(self) -> tuple[LogEntry, ...]:
+        """The active corrections of identity, which the logs of all animals of an arena have."""
+        found = [one for one in self.standing if isinstance(one.what, Roles)]
+        return tuple(sorted(found, key=lambda one: one.what.serial))  # type: ignore[union-attr]
+
+    def beside(self, session: Path) -> list[Path]:
+        """The sessions of all animals of an arena, with the one of this log.
+
+        Args:
+            session: its folder.
+        """
+        whats = [one.what for one in self.entries if isinstance(one.what, Roles)]
+        names = dict.fromkeys(Path(name).name for what in whats for name in what.sessions)
+        return [session.parent / name for name in names]
 
     @property
     def described(self) -> dict[str, str]:
@@ -313,9 +364,16 @@ class Log:
         undos = {entry.number for entry in self.entries if entry.what is None}
         redone = any(entry.undoes in undos for entry in self.entries)
         clocked = any(isinstance(entry.what, ClockFit) for entry in self.entries)
+        identified = any(isinstance(entry.what, Roles) for entry in self.entries)
         document = {
             # readable by earlier versions
-            "schema_version": SCHEMA_VERSION if clocked else 3 if redone else 2,
+            "schema_version": SCHEMA_VERSION
+            if identified
+            else 4
+            if clocked
+            else 3
+            if redone
+            else 2,
             "made_of": self.made_of,
             "entries": [entry.to_dict() for entry in self.entries],
             "files": self.files,
@@ -346,7 +404,23 @@ def corrected_folder(session: Path) -> Path:
     """Folder of a session's corrections; while it is being replaced, the previous one."""
     folder = session / FOLDER
     old = session / f"{FOLDER}.old"
+    new = session / NEW
+    if new.is_dir() and _is_valid(new):
+        return new
     return old if old.is_dir() and not folder.is_dir() else folder
+
+
+def _is_valid(new: Path) -> bool:
+    """Whether all animals of an arena have the corrections of identity of one of them."""
+    log = _read(new / LOG)
+    wanted = [one.what for one in log.shared]
+    return all(
+        any(
+            [one.what for one in _read(beside / folder / LOG).shared] == wanted
+            for folder in (NEW, FOLDER, f"{FOLDER}.old")
+        )
+        for beside in log.beside(new.parent)
+    )
 
 
 def basis(session: Path, metadata: Mapping[str, Any]) -> str:
@@ -374,7 +448,11 @@ def read_log(session: Path) -> Log:
     Raises:
         SessionError: the log is damaged or was written by a later version.
     """
-    path = corrected_folder(session) / LOG
+    return _read(corrected_folder(session) / LOG)
+
+
+def _read(path: Path) -> Log:
+    """The log in a file, see `read_log`."""
     if not path.is_file():
         return Log("")
     try:
@@ -400,6 +478,20 @@ def read_log(session: Path) -> Log:
 def applies(log: Log, session: Path, metadata: Mapping[str, Any]) -> bool:
     """Whether the log has active corrections that were made on these poses and bouts."""
     return bool(log.standing) and log.made_of == basis(session, metadata)
+
+
+def read_verdict(session: Path) -> Mapping[str, Any]:
+    """The verdict on the session in a folder, as in `verdict_in`; that of its corrections if any.
+
+    Args:
+        session: the session folder.
+    """
+    document = loose_json(session / "session.json")
+    with suppress(SessionError):
+        log = read_log(session)
+        if "verdict" in log.facts and applies(log, session, document):
+            document = {**document, **log.facts}
+    return verdict_in(document)
 
 
 def with_description(metadata: Mapping[str, Any], described: Mapping[str, str]) -> dict[str, Any]:

@@ -281,6 +281,30 @@ def read_flips(session: Session) -> list[Flip]:
         ]
 
 
+def read_crossings(session: Session) -> tuple[Crossing, ...] | None:
+    """The table `crossings`, with frames counted by row; None for an animal measured alone.
+
+    Args:
+        session: the session.
+    """
+    if not session.has("crossings.parquet"):
+        return None
+    index = session.frames["frame_index"].to_numpy()
+    with reading_from(session.file("crossings.parquet")):
+        return tuple(
+            Crossing(
+                int(np.searchsorted(index, row["start_frame"])),
+                int(np.searchsorted(index, row["stop_frame"])),
+                tuple(int(name.removeprefix("animal")) - 1 for name in row["animals"].split(";")),
+                float(row["p_swap"]),
+                str(row["decided_by"]),
+                str(row.get("reviewed_by", "")),  # missing in earlier versions
+                str(row.get("reviewed_at", "")),
+            )
+            for row in session.crossings.to_dict("records")
+        )
+
+
 def provenance_of(session: Session, skeleton: Skeleton) -> Provenance:
     """Provenance of a session, as stated when it was first written.
 

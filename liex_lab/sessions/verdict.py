@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from liex_lab.runtime.text_files import loose_json
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import DOUBTFUL, Tracked
 
@@ -161,20 +160,12 @@ class Verdict:
         }
 
 
-def read_verdict(folder: Path) -> Mapping[str, Any]:
-    """The verdict in a session's folder, or a default for sessions of earlier versions.
-
-    Args:
-        folder: the session folder.
+def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The verdict in the content of a session.json, or a default for earlier versions.
 
     Returns:
         At least `look_at_it`, `accepted`, `reasons`, `cautions` and `sentence` ("" if absent).
     """
-    return verdict_in(loose_json(folder / "session.json"))
-
-
-def verdict_in(document: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The verdict in the content of a session.json, as in `read_verdict`."""
     default = {
         "look_at_it": False,
         "accepted": False,

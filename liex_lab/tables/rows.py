@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from liex_lab.actions.ethogram import Ethogram, runs_of
+from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import Gap, frames_apart, rounded_step
 from liex_lab.recordings.timestamps import median_step as recorded_step
@@ -47,6 +48,7 @@ NOT_FROM_CAMERA = (
     HIDDEN,
     "tracker_lost",
 )  # reasons of gaps not caused by the camera
+ROUNDED_S = 5e-4  # times are typed with three decimals
 NEAR = 0.1  # radius of a joint's score, as a share of the spine
 
 
@@ -270,7 +272,10 @@ class Rows:
                 [";".join(f"animal{k + 1}" for k in one.animals) for one in crossings], str
             ),
             "p_swap": np.array([one.p_swap for one in crossings], float),
-            "decided_by": np.array([one.decided_by for one in crossings], str),
+            **{
+                name: np.array([getattr(one, name) for one in crossings], str)
+                for name in ("decided_by", "reviewed_by", "reviewed_at")
+            },
         }
 
     def _camera_gaps(self) -> list[_Found]:
@@ -409,6 +414,27 @@ def frame_count(frame_index: NDArray[np.int64]) -> NDArray[np.int64]:
         frame_index: (n,) index of each frame in the recording.
     """
     return np.append(frame_index, frame_index[-1:] + 1)
+
+
+def rows_between(time_s: Array, start_s: float, stop_s: float, what: str) -> tuple[int, int]:
+    """First row of a span of time, and the first row after it.
+
+    Args:
+        time_s: (n,) times of the frames, s since the first.
+        start_s: start, s since the first frame.
+        stop_s: stop, s, exclusive.
+        what: name of the span, for the error message.
+
+    Raises:
+        SessionError: the span has no frame.
+    """
+    first, last = (int(np.searchsorted(time_s, at - ROUNDED_S)) for at in (start_s, stop_s))
+    if not (start_s < stop_s and first < last):
+        raise SessionError(
+            f"{what} is from a time to a later one, in seconds since the first frame, and holds a "
+            f"frame; got {start_s:g} to {stop_s:g} in a session of 0 to {time_s[-1]:.3f} s"
+        )
+    return first, last
 
 
 def constant_runs(labels: NDArray[Any]) -> list[tuple[int, int, Any]]:

@@ -5,12 +5,13 @@ cost of an assignment is the sum over the animals of the association's transitio
 Mahalanobis distance of the shift and bend of the joints between two frames; the emission cost is
 that of the sizes, if the animals differ in it. Viterbi's path (Viterbi 1967) is the assignment over
 the whole recording, and the forward pass from one end of a crossing to the other gives the
-probability that its animals left it exchanged. Frames in which not all animals are in view follow
-their neighbours.
+probability that its animals left it exchanged. RFID readings add to the emission cost; which animal
+carries which tag is the map of least cost over the recording (`rfid`). Frames in which not all
+animals are in view follow their neighbours.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -20,6 +21,7 @@ from liex_lab.runtime.kernels import kernel
 from liex_lab.tracking._association_kernels import transition_cost
 from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.observations import COLUMNS, Array, Observations
+from liex_lab.tracking.rfid import Readings
 from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Crossing, Subject, Tracked, spans
 from liex_lab.tracking.trust import MOST_ERROR, contradicted
@@ -34,6 +36,7 @@ _VELOCITY_S = 0.2  # time over which their velocity is measured
 _PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
 _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
+_OFF = 2.0  # nats, of a reading whose tag is two half lengths beyond the antenna's range
 _COVERED = 0.35  # hidden area, in animals, from which their poses are unknown
 _JOIN_S = 0.5  # crossings nearer to each other are one
 
@@ -45,14 +48,23 @@ class Identity:
     Attributes:
         slots: (n, N) component of each animal, `NONE` if it is not in view.
         crossings: in order of time.
+        tags: the tag of each animal, "" if unknown; empty without readings.
+        misfits: how the readings do not fit the animals' places.
+        remarks: sentences on single readings.
     """
 
     slots: Slots
     crossings: tuple[Crossing, ...]
+    tags: tuple[str, ...] = ()
+    misfits: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def identify(
-    observed: Sequence[Observations], subjects: Sequence[Subject], areas_mm2: Sequence[float]
+    observed: Sequence[Observations],
+    subjects: Sequence[Subject],
+    areas_mm2: Sequence[float],
+    readings: Readings | None = None,
 ) -> Identity:
     """Assign the components of every frame to the animals.
 
@@ -60,6 +72,7 @@ def identify(
         observed: for each animal, all frames measured with its body.
         subjects: the animals.
         areas_mm2: their usual areas.
+        readings: RFID readings; None without any.
     """
     n_animals = len(observed)
     known = observed[0].known[:, ::2]
@@ -67,6 +80,7 @@ def identify(
     slots = np.full((len(known), n_animals), NONE, np.int64)
     states = np.array(list(permutations(range(n_animals))))
     crossings: tuple[Crossing, ...] = ()
+    marked = Identity(slots, ())
     if len(full):
         # of all bodies: how smoothly each fits a component does not show whose component it is
         moves = np.min(
@@ -74,14 +88,65 @@ def identify(
         )
         # cost (m - 1, S, S) of going from one assignment to another
         transition = moves[:, states[:, None, :], states[None, :, :]].sum(axis=-1)
-        emission = _sizes(observed[0][full], np.array(areas_mm2), states)
-        path = _viterbi(transition, emission)
+        sizes = emission = _sizes(observed[0][full], np.array(areas_mm2), states)
+        path, _ = _viterbi(transition, emission)
         _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
-        path = _viterbi(transition, emission)
+        path, _ = _viterbi(transition, emission)
+        if readings is not None:
+            places = observed[0].centroid_mm[full, ::2, :2].astype(float)
+            read = readings.costs(observed[0].seconds[full], places, subjects[0].length_mm)
+            path, emission, marked = _by_tags(readings, *read, transition, sizes, path, states)
         slots[full] = states[path]
-        crossings = _crossings(observed[0], full, transition, emission, path, states)
+        by = {"motion": np.zeros_like(sizes), "size": sizes, "rfid": emission}
+        crossings = _crossings(observed[0], full, transition, by, path, states)
     _follow(observed, subjects, slots, known)
-    return Identity(slots, crossings)
+    return replace(marked, slots=slots, crossings=crossings)
+
+
+def _by_tags(
+    readings: Readings,
+    tag: Slots,
+    row: Slots,
+    cost: Array,
+    transition: Array,
+    sizes: Array,
+    path: Slots,
+    states: Slots,
+) -> tuple[Slots, Array, Identity]:
+    """The path (m,) and the emission cost (m, S) with readings, and which animal has which tag.
+
+    Readings that fit no animal in more than half of the cases are not used.
+
+    Args:
+        readings: the readings.
+        tag: (k,) number of the tag of each reading near a frame.
+        row: (k,) the frame.
+        cost: (k, N) cost if the animal of each component carries the tag.
+        transition: (m - 1, S, S) cost.
+        sizes: (m, S) emission cost without readings.
+        path: (m,) the path without readings.
+        states: (S, N) the assignments.
+    """
+    reading = np.arange(len(tag))[:, None]
+    n_animals = states.shape[1]
+    found = []
+    for carriers in permutations(range(n_animals), len(readings.tags)):
+        emission = sizes.copy()
+        np.add.at(emission, row, cost[reading, states[:, np.array(carriers)[tag]].T])
+        found.append((*_viterbi(transition, emission), emission, carriers))
+    best, _, emission, carriers = min(found, key=lambda one: one[1])
+    of_animals = cost[reading, states[best][row]]  # (k, N)
+    totals = [of_animals[reading[:, 0], np.array(one[3])[tag]].sum() for one in found]
+    certain = 1.0 / np.exp(min(totals) - np.array(totals)).sum()
+    is_off = of_animals[reading[:, 0], np.array(carriers)[tag]] > _OFF
+    said = f"at {is_off.sum()} of {len(tag)} RFID readings the animal is not at the antenna"
+    told = Identity(states[best], (), remarks=(*readings.remarks, *[said] * bool(is_off.any())))
+    if not len(tag) or is_off.mean() > 0.5 or certain < CERTAIN:
+        why = said if is_off.any() else f"{len(tag)} RFID readings do not distinguish the animals"
+        advice = "check animal.rfid.antennas and offset_s; the tags were not used"
+        return path, sizes, replace(told, misfits=(f"{why}: {advice}",))
+    names = dict(zip(carriers, readings.tags, strict=True))
+    return best, emission, replace(told, tags=tuple(names.get(k, "") for k in range(n_animals)))
 
 
 def own_observations(observed: Observations, slots: Slots) -> Observations:
@@ -230,8 +295,8 @@ def _sizes(observed: Observations, areas_mm2: Array, states: Slots) -> Array:
     return np.asarray(0.5 * weight[:, None] * np.minimum(off.sum(axis=-1), 18.0))
 
 
-def _viterbi(transition: Array, emission: Array) -> Slots:
-    """The path (m,) of least cost through the assignments."""
+def _viterbi(transition: Array, emission: Array) -> tuple[Slots, float]:
+    """The path (m,) of least cost through the assignments, and its cost."""
     parent = np.zeros(emission.shape, np.int64)
     cost = emission[0]
     for t, step in enumerate(transition, 1):
@@ -242,18 +307,21 @@ def _viterbi(transition: Array, emission: Array) -> Slots:
     path[-1] = cost.argmin()
     for t in range(len(path) - 1, 0, -1):
         path[t - 1] = parent[t, path[t]]
-    return path
+    return path, float(cost.min())
 
 
 def _crossings(
     observed: Observations,
     full: Slots,
     transition: Array,
-    emission: Array,
+    by: Mapping[str, Array],
     path: Slots,
     states: Slots,
 ) -> tuple[Crossing, ...]:
-    """The stretches in which another assignment is possible, with its probability."""
+    """The stretches in which another assignment is possible, with its probability.
+
+    `by` are emission costs (m, S), each with one more kind of evidence, by its name.
+    """
     seconds = observed.seconds
     steps = np.arange(len(full) - 1)
     others = transition[steps, path[:-1]] - transition[steps, path[:-1], path[1:]][:, None]
@@ -266,21 +334,25 @@ def _crossings(
     apart = np.flatnonzero(seconds[full[at[1:]]] - seconds[full[at[:-1] + 1]] > _JOIN_S)
     begins = at[np.append(0, apart + 1)]
     ends = at[np.append(apart, len(at) - 1)] + 1
-    later = _backward(transition, emission)
+    emission = np.stack([*by.values()], axis=1)  # (m, K, S)
+    later = np.stack([_backward(transition, one) for one in by.values()], axis=1)
+    later[:, 0] = 0.0  # motion is that of the crossing
     found = []
     for begin, end in zip(begins, ends, strict=True):
-        cost = np.full((2, len(states)), np.inf)  # with the sizes, and by motion alone
+        cost = np.full((len(by), len(states)), np.inf)
         cost[:, path[begin]] = 0.0
         for t in range(begin, end):
             cost = -np.logaddexp.reduce(-(cost[..., None] + transition[t]), axis=1)
-            cost[0] += emission[t + 1]
-        cost[0] += later[end]
+            cost += emission[t + 1]
+        cost += later[end]
         p = np.exp(cost.min(axis=1, keepdims=True) - cost)
-        p_swap, by_motion = 1.0 - p[:, path[end]] / p.sum(axis=1)
-        decided_by = "size" if by_motion > max(2.0 * p_swap, 0.02) else "motion"
+        p_swaps = 1.0 - p[:, path[end]] / p.sum(axis=1)
+        p_swap = p_swaps[-1]
+        enough = np.flatnonzero(p_swaps <= max(2.0 * p_swap, 0.02))
+        decided_by = [*by][enough[0]]
         # of each animal, and of those of the likeliest exchange at least
-        exchanged = p[0] @ (states != states[path[end]]) / p[0].sum()
-        second = states[np.argsort(cost[0])[:2]]
+        exchanged = p[-1] @ (states != states[path[end]]) / p[-1].sum()
+        second = states[np.argsort(cost[-1])[:2]]
         some = (exchanged > 0.1 * p_swap) | (second[0] != second[1])
         animals = tuple(int(k) for k in np.flatnonzero(some))
         found.append(

@@ -251,7 +251,9 @@ class Crossing:
         stop: frame after the last.
         animals: which of them, from 0.
         p_swap: probability that they leave it in other roles than in the tracks.
-        decided_by: what decided it: motion or size.
+        decided_by: what decided it: motion, size or rfid, or human.
+        reviewed_by: the person who reviewed it; "" if nobody did.
+        reviewed_at: when, ISO 8601.
     """
 
     start: int
@@ -259,6 +261,8 @@ class Crossing:
     animals: tuple[int, ...]
     p_swap: float
     decided_by: str
+    reviewed_by: str = ""
+    reviewed_at: str = ""
 
 
 @dataclass(frozen=True)

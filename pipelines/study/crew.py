@@ -19,7 +19,7 @@ from liex_lab.errors import RecordingError, StudyError
 from liex_lab.plan.study import PlannedSession
 from liex_lab.runtime import processes, text_files
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions import folder, verdict
+from liex_lab.sessions import corrections, folder
 
 from .status import (
     INSPECTING,
@@ -93,7 +93,7 @@ def measure_one(
         **_result(session, "done"),
         "seconds": round(time.perf_counter() - began, 3),
         "corrections_taken_from": folder.taken_from(session.folder),
-        "review": review_note(verdict.read_verdict(session.folder)),
+        "review": review_note(corrections.read_verdict(session.folder)),
     }
 
 

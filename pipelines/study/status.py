@@ -23,10 +23,16 @@ from liex_lab.plan import Plan, sections
 from liex_lab.plan.study import VIRTUAL, PlannedSession, Study, find_subject, same
 from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.sessions.corrections import DESCRIBED, START, read_log, with_description
+from liex_lab.sessions.corrections import (
+    DESCRIBED,
+    START,
+    read_log,
+    read_verdict,
+    with_description,
+)
 from liex_lab.sessions.folder import describe_failure, read_failure
 from liex_lab.sessions.provenance import SCHEMA_VERSION, package_version, versions
-from liex_lab.sessions.verdict import CAUTION, NEEDS_REVIEW, state_in_words, verdict_in
+from liex_lab.sessions.verdict import CAUTION, NEEDS_REVIEW, state_in_words
 
 from ..build import animal_facts, build_estimator, build_recording, open_planned
 from ..choice import fit_plan
@@ -442,7 +448,7 @@ def _measured(session: PlannedSession, file: Path) -> SessionStatus:
     if why:
         return SessionStatus(session, "changed", why, described=described)
     input = str(document.get("input", {}).get("sha256", ""))
-    return SessionStatus(session, "done", review_note(verdict_in(document)), input=input)
+    return SessionStatus(session, "done", review_note(read_verdict(session.folder)), input=input)
 
 
 def to_check(found: Sequence[SessionStatus]) -> list[str]:

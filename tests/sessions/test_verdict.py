@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from liex_lab.sessions.verdict import Verdict, read_verdict, verdict_in
+from liex_lab.sessions.corrections import read_verdict
+from liex_lab.sessions.verdict import Verdict, verdict_in
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.observations import Observations
 from tests.tracking.stories import SUBJECT, lose, told, walk
