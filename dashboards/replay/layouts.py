@@ -11,6 +11,7 @@ import rerun.blueprint as rrb
 
 from liex_lab.behaviour.body import drawn_measures
 from liex_lab.runtime.durable import replacing, write_whole
+from liex_lab.runtime.text_files import value_at
 from liex_lab.scene.height_maps import N_OBJECTS
 from liex_lab.sessions import Session, cutouts, rrd_scene, viewer
 from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
@@ -61,7 +62,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     scene = _scene(body_m, at(SKELETON), ["$origin/**", *(f"- /{name}/**" for name in hidden)])
     plan = session.get("plan", {})
     kept = plan.get("replay", {}).get("depth")
-    count = plan.get("animal", {}).get("count", 1)
+    count = value_at(plan, ("animal", "count")) or 1
     n_boxes = N_OBJECTS if count == "auto" else max(cutouts.N_BOXES, count)
     # the coordinate frames of the cut-outs in the image, by their entities; rerun's types of
     # overrides leave them out
