@@ -15,6 +15,7 @@ from liex_lab.recordings.depth_kernels import to_millimetres
 from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, cutouts, evidence, rrd
+from liex_lab.sessions.individuals import arena_name, by_arena
 from liex_lab.sessions.session import stretch, video_path
 
 from .build import build_recording
@@ -94,13 +95,15 @@ def export_video(
 ) -> Path:
     """Write a video (H.264): height above the floor, skeleton, trail, action and time.
 
-    One session is shown from beginning to end, on its own clock; several are shown side by side, by
-    group. With `actions`, the video contains clips of these bouts, aligned at the onsets; a
-    session's report links to the videos in its folder.
+    One session is shown from beginning to end, on its own clock, and the animals of one arena over
+    one depth image; several are shown side by side, by group. With `actions`, the video contains
+    clips of these bouts, aligned at the onsets; a session's report links to the videos in its
+    folder.
 
     Args:
         places: a session folder, several, or folders that contain sessions at any depth.
-        out: the output folder; None uses the session's own, or the current folder for several.
+        out: the output folder; None uses the session's own, of animals of one arena the folder
+            of the first, or the current folder for several.
         actions: actions, or prefixes of them: rear includes rear_supported and rear_unsupported.
         groups: only sessions of these groups; () includes all.
         start_s: start of a stretch of one session, s.
@@ -118,7 +121,7 @@ def export_video(
     """
     given = [places] if isinstance(places, str | Path) else list(places)
     opened = [Session.open(folder) for folder in find_sessions(given)]
-    named = [(session, str(session.table("sessions")["group"].iloc[0] or "")) for session in opened]
+    named = [(some, _group_of(some)) for some in by_arena(opened)]
     chosen = [pair for pair in named if not groups or pair[1] in groups]
     if not chosen:
         there = ", ".join(sorted({group for _, group in named} - {""})) or "none"
@@ -128,14 +131,16 @@ def export_video(
         SessionError,
         (
             part and (len(chosen) > 1 or actions),
-            "a stretch of time is shown of one session, without actions",
+            "a stretch of time is shown of one session or arena, without actions",
         ),
         (not slower > 0, f"slower is a number above 0, such as 4, got {slower:g}"),
     )
-    alone = chosen[0][0]
-    folder = Path(out) if out is not None else alone.path if len(chosen) == 1 else Path()
+    first, *others = chosen[0][0]
+    beside = first.path.parent if others else first.path
+    folder = Path(out) if out is not None else beside if len(chosen) == 1 else Path()
     what = stretch(start_s, stop_s) if part else "+".join(actions)
-    path = video_path(folder, alone.name if len(chosen) == 1 else "sessions", what)
+    named_as = arena_name(first) if others else first.name
+    path = video_path(folder, named_as if len(chosen) == 1 else "sessions", what)
     if path.exists() and not overwrite:
         raise SessionError(
             f"{path} exists already; name another place with --out, or use --overwrite (in Python "
@@ -143,12 +148,18 @@ def export_video(
         )
     if len(chosen) == 1 and not actions:
         return write_session(
-            alone, path, start_s=start_s, stop_s=stop_s, slower=slower, progress=progress
+            [first, *others], path, start_s=start_s, stop_s=stop_s, slower=slower, progress=progress
         )
     write_clips(chosen, path, actions, slower=slower, progress=progress)
-    if folder == alone.path:
+    if folder == first.path:
         write_report(folder)  # which links to it
     return path
+
+
+def _group_of(sessions: Sequence[Session]) -> str:
+    """The group of the animals of one arena; all of them if they differ."""
+    groups = [str(one.table("sessions")["group"].iloc[0] or "") for one in sessions]
+    return " and ".join(dict.fromkeys(group for group in groups if group))
 
 
 # Whole depth images for a session's replay, `liex show --depth all`.

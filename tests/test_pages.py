@@ -76,6 +76,7 @@ AFTER = {
     "docs/howto/skin-points.md": "README.md",
     "docs/howto/spreadsheet.md": "README.md",
     "docs/howto/sync.md": "README.md",
+    "docs/reference/exports.md": "docs/tutorials/two-mice.md",
     "docs/reference/session-folder.md": "README.md",
     "docs/tutorials/study.md": "docs/tutorials/mouse.md",
 }

@@ -21,7 +21,7 @@ from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
-from . import groups, places, times
+from . import groups, places, social, times
 from .animals import DepthImages, SessionAnimal, keeps_depth, session_animals
 from .style import FORMATS, drawing, image_bytes, on_page
 
@@ -39,6 +39,8 @@ OF_SESSION: dict[str, tuple[str, Callable[[SessionAnimal], Figure | None]]] = {
     "time_budget": ("share of the time in each action", times.time_budget),
     "activity": ("shares of the actions over the session", times.activity),
     "transitions": ("what follows upon what, against chance", times.transitions),
+    "interactions": ("who did what to whom, number and time", social.interaction_matrix),
+    "network": ("the group of animals and their interactions", social.interaction_network),
     "onsets": ("measures about the onsets of actions", times.aligned_curves),
     "events": ("measures about events of another instrument", times.event_curves),
     "distance": ("distance summed up over the session", times.cumulative_distance),

@@ -11,6 +11,8 @@ import rerun.blueprint as rrb
 
 from liex_lab.behaviour.body import drawn_measures
 from liex_lab.runtime.durable import replacing, write_whole
+from liex_lab.runtime.text_files import value_at
+from liex_lab.scene.height_maps import N_OBJECTS
 from liex_lab.sessions import Session, cutouts, rrd_scene, viewer
 from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
 
@@ -58,12 +60,15 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     body_m = float(animal.get("spine_mm") or animal["home_length_mm"]) / 1000.0
     hidden = [OVERLAY, corrected_entity(OVERLAY), *(f"arena/{name}" for name in measured)]
     scene = _scene(body_m, at(SKELETON), ["$origin/**", *(f"- /{name}/**" for name in hidden)])
-    kept = session.get("plan", {}).get("replay", {}).get("depth")
+    plan = session.get("plan", {})
+    kept = plan.get("replay", {}).get("depth")
+    count = value_at(plan, ("animal", "count")) or 1
+    n_boxes = N_OBJECTS if count == "auto" else max(cutouts.N_BOXES, count)
     # the coordinate frames of the cut-outs in the image, by their entities; rerun's types of
     # overrides leave them out
     frames: dict[Any, Any] = {
         rrd_scene.cutout_entity(k, which): rr.CoordinateFrame(rrd_scene.cutout_frame(k))
-        for k in range(cutouts.N_BOXES)
+        for k in range(n_boxes)
         for which in range(cutouts.N_WINDOWS)
     }
     image: Any = rrb.Spatial2DView(

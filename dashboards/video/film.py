@@ -1,4 +1,7 @@
-"""One session as a film: its image at any time, with skeletons, trail, action and time."""
+"""One session as a film: its image at any time, with skeletons, trail, action and time.
+
+Several animals of one arena have a colour and a name each, and their interactions are named.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,15 +10,17 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pandas as pd
 from matplotlib import colormaps
 from matplotlib.font_manager import findfont
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from liex_lab.actions.vocabulary import action_colours
+from liex_lab.actions.vocabulary import INTERACTIONS, action_colours, individual_colours
 from liex_lab.errors import SessionError
 from liex_lab.optics.camera import Camera
 from liex_lab.sessions import Session
+from liex_lab.sessions.individuals import individuals_of
 
 from ..figures.animals import (
     Array,
@@ -29,6 +34,7 @@ from ..figures.places import in_image
 
 _PLAIN = 128  # neutral light
 _LIGHT = np.array([-0.5, -0.6])
+_WHITE = (255, 255, 255)
 
 
 class Relief:
@@ -247,11 +253,19 @@ class Footage:
         session: the opened session.
         images: the depth images.
         top_mm: height of the lightest colour, mm; None takes the session's own scale.
+        others: the sessions of other animals of its arena.
     """
 
-    def __init__(self, session: Session, images: DepthImages, top_mm: float | None = None) -> None:
+    def __init__(
+        self,
+        session: Session,
+        images: DepthImages,
+        top_mm: float | None = None,
+        others: Sequence[Session] = (),
+    ) -> None:
         self.session = session
-        self.animals = session_animals(session)
+        self._of_each = [session_animals(one) for one in (session, *others)]
+        self.animals = [animal for some in self._of_each for animal in some]
         self.bones = [(int(a), int(b)) for a, b in session.metadata["animal"]["bones"]]
         self._images = images
         self._top_mm = top_mm
@@ -264,7 +278,7 @@ class Footage:
     @cached_property
     def uv(self) -> list[Array]:
         """The joints of each animal (n, J, 2), px; NaN without a pose."""
-        return joints_in_image(self.animals, len(self.time_s))
+        return [uv for some in self._of_each for uv in joints_in_image(some, len(self.time_s))]
 
     @cached_property
     def paths(self) -> list[tuple[Array, int]]:
@@ -289,14 +303,15 @@ class Film(Footage):
     Args:
         session: the opened session.
         top_mm: height of the lightest colour, mm.
+        others: the sessions of other animals of its arena.
 
     Raises:
         SessionError: the session has no depth.
     """
 
-    def __init__(self, session: Session, top_mm: float) -> None:
+    def __init__(self, session: Session, top_mm: float, others: Sequence[Session] = ()) -> None:
         images = DepthImages()
-        super().__init__(session, images, top_mm)
+        super().__init__(session, images, top_mm, others)
         self.close = images.close
         if not keeps_depth(session) or images.depth(session, 0) is None:
             self.close()
@@ -305,6 +320,7 @@ class Film(Footage):
                 "run `liex run` on its recording again, without --no-depth"
             )
         self._colours = action_colours(self.animals[0].words)
+        self._own = individual_colours(individuals_of(session)) if others else {}
         self._last: tuple[int, NDArray[np.uint16]] | None = None
 
     @property
@@ -354,6 +370,18 @@ class Film(Footage):
             words.append(str(actions[at]) if at >= 0 and stop[at] > time_s + 1e-6 else "")
         return words
 
+    def interactions_at(self, time_s: float) -> list[tuple[str, str, str]]:
+        """What the animals do to each other at a time, s: agent, target and word."""
+        if not self._own:
+            return []
+        table = self._interactions
+        now = table[(table["start_s"] <= time_s + 1e-6) & (table["stop_s"] > time_s + 1e-6)]
+        return [*now[["agent", "target", "action"]].itertuples(index=False, name=None)]
+
+    @cached_property
+    def _interactions(self) -> pd.DataFrame:
+        return self.session.interactions.query("target != ''")
+
     @cached_property
     def _bouts(self) -> list[list[Any]]:
         names = ("action", "start_s", "stop_s")
@@ -380,13 +408,19 @@ class Film(Footage):
         shown = self.relief.image(self._last[1], view.left, view.top, side, size)
         scale = np.divide(size, side)
         words = self.words_at(time_s)
-        for joints, word in zip(self.uv, words, strict=True):
-            self._draw_animal(shown, (joints + 0.5 - [view.left, view.top]) * scale, row, word)
+        placed = [(joints + 0.5 - [view.left, view.top]) * scale for joints in self.uv]
+        for at, word, animal in zip(placed, words, self.animals, strict=True):
+            colour = self._own.get(animal.individual) or self._colours.get(word, "#ffffff")
+            self._draw_animal(shown, at, row, _rgb(colour))
+        if self._own:
+            self._write_names(shown, np.stack([at[row] for at in placed]))
         self._write(shown, time_s, row, words, title)
         self._write_length(shown, self.relief.pixel_mm * view.width / size[0])
         return shown
 
-    def _draw_animal(self, image: NDArray[np.uint8], at: Array, row: int, word: str) -> None:
+    def _draw_animal(
+        self, image: NDArray[np.uint8], at: Array, row: int, colour: tuple[int, int, int]
+    ) -> None:
         """Draw trail and skeleton; `at` (n, J, 2) are the joints in the image, px."""
         size = max(image.shape[1] / 320.0, 0.9)
         first = self.row_at(self.time_s[row] - 2.0)  # the trail of the last two seconds
@@ -394,36 +428,44 @@ class Film(Footage):
         trail = trail[np.isfinite(trail).all(axis=1)]
         if len(trail) > 1:
             fixed = np.rint(16.0 * trail).astype(np.int32)
-            cv2.polylines(image, [fixed], False, (235, 235, 235), 1, cv2.LINE_AA, 4)
+            shade = colour if self._own else (235, 235, 235)
+            cv2.polylines(image, [fixed], False, shade, 1, cv2.LINE_AA, 4)
         joints = at[row]
         if not np.isfinite(joints).all():
             return
-        colour = _rgb(self._colours.get(word, "#ffffff"))
         fixed = np.rint(16.0 * joints).astype(int).tolist()
         thick = max(int(round(1.6 * size)), 2)
         for shade, width in (((0, 0, 0), thick + 2), (colour, thick)):
             for a, b in self.bones:
                 cv2.line(image, fixed[a], fixed[b], shade, width, cv2.LINE_AA, 4)
-        for at_px, fill in zip(
-            fixed, [(255, 255, 255)] * (len(fixed) - 1) + [(238, 102, 119)], strict=True
-        ):
-            cv2.circle(image, at_px, int(16 * 2.0 * size), fill, -1, cv2.LINE_AA, 4)
+        fill, front = (colour, _WHITE) if self._own else (_WHITE, (238, 102, 119))
+        for at_px, shade in zip(fixed, [fill] * (len(fixed) - 1) + [front], strict=True):
+            cv2.circle(image, at_px, int(16 * 2.0 * size), shade, -1, cv2.LINE_AA, 4)
+
+    def _write_names(self, image: NDArray[np.uint8], joints: Array) -> None:
+        """Write the name of each animal above or below its joints (A, J, 2) px, away from the
+        others.
+        """
+        size = _size_of(image)
+        posed = np.isfinite(joints).all(axis=(1, 2))
+        middle = joints[posed, :, 1].mean() if posed.any() else 0.0
+        for animal, own in zip(np.array(self.animals)[posed], joints[posed], strict=True):
+            above = own[:, 1].mean() <= middle
+            x, y = own[:, 0].min(), own[:, 1].min() - 2 * size if above else own[:, 1].max() + size
+            colour = _rgb(self._own[animal.individual])
+            write(image, animal.individual, int(x), int(y), size, colour)
 
     def _write(
         self, image: NDArray[np.uint8], time_s: float, row: int, words: list[str], title: str
     ) -> None:
         """Draw title, action, time, and the height scale."""
         height, width = image.shape[:2]
-        size = max(height // 26, 9)
+        size = _size_of(image)
         edge = size // 2
         write(image, title, edge, edge, size)
         write(image, f"{time_s:.2f} s", width - edge, height - 2 * size, size, right=True)
-        x = edge
-        for word in dict.fromkeys(word for word in words if word):
-            top = height - 2 * size
-            image[top + 2 : top + size, x : x + size - 2] = _rgb(self._colours[word])
-            x += write(image, word.replace("_", " "), x + size + 2, top, size) + 2 * size
-        if not any(np.isfinite(joints[row]).all() for joints in self.uv):
+        self._write_words(image, time_s, row, words)
+        if not self._own and not self._posed(row).any():
             write(image, "no pose", edge, height - 4 * size, size, (255, 190, 90))
         bar = self.relief.scale(min(6 * size, height // 3))
         right = width - edge - 6
@@ -431,12 +473,42 @@ class Film(Footage):
         for text, y in ((f"{self.relief.top_mm:.0f} mm", edge), ("0", edge + len(bar) - size)):
             write(image, text, right - 4, y, max(size - 2, 8), right=True)
 
+    def _posed(self, row: int) -> NDArray[np.bool_]:
+        """(A,) whether each animal has a pose in a frame."""
+        return np.array([np.isfinite(joints[row]).all() for joints in self.uv])
+
+    def _write_words(
+        self, image: NDArray[np.uint8], time_s: float, row: int, words: list[str]
+    ) -> None:
+        """Draw the actions below, a line for each of several animals, and interactions above."""
+        size = _size_of(image)
+        edge = size // 2
+        if not self._own:
+            x, top = edge, image.shape[0] - 2 * size
+            for word in dict.fromkeys(word for word in words if word):
+                image[top + 2 : top + size, x : x + size - 2] = _rgb(self._colours[word])
+                x += write(image, word.replace("_", " "), x + size + 2, top, size) + 2 * size
+            return
+        below = [
+            (animal.individual, f"{animal.individual}: {word if posed else 'no pose'}")
+            for animal, word, posed in zip(self.animals, words, self._posed(row), strict=True)
+        ]
+        above = [
+            (a, f"{a} {'–' if INTERACTIONS[word].mutual else '→'} {b}: {word}")
+            for a, b, word in self.interactions_at(time_s)
+        ]
+        for some, top in ((above, 2 * size), (below, image.shape[0] - (len(below) + 1) * size)):
+            for k, (name, text) in enumerate(some):
+                y = top + k * size
+                image[y + 2 : y + size, edge : edge + size - 2] = _rgb(self._own[name])
+                write(image, text.replace("_", " "), edge + size + 2, y, size)
+
     def _write_length(self, image: NDArray[np.uint8], pixel_mm: float) -> None:
         """Draw a scale bar of 1, 2 or 5 times a power of ten mm; `pixel_mm` is mm/px on the
         floor.
         """
         height, width = image.shape[:2]
-        size = max(height // 26, 9)
+        size = _size_of(image)
         longest_mm = pixel_mm * width / 5.0
         step_mm = 10.0 ** np.floor(np.log10(longest_mm))
         length_mm = max(step_mm * k for k in (1, 2, 5) if step_mm * k <= longest_mm)
@@ -450,3 +522,8 @@ class Film(Footage):
 def _rgb(colour: str) -> tuple[int, int, int]:
     """#rrggbb as numbers."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def _size_of(image: NDArray[np.uint8]) -> int:
+    """The height of letters in an image, px."""
+    return max(image.shape[0] // 26, 9)

@@ -19,6 +19,7 @@ from liex_lab.errors import SessionError
 from liex_lab.runtime.durable import replacing, unlinked
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
+from liex_lab.sessions.individuals import arena_name
 
 from ..figures.groups import NO_GROUP
 from ..units import counted
@@ -140,7 +141,7 @@ class Cell:
 
 
 def write_session(
-    session: Session,
+    sessions: Sequence[Session],
     path: Path,
     *,
     start_s: float | None = None,
@@ -148,24 +149,28 @@ def write_session(
     slower: float = 1.0,
     progress: Progress = silent,
 ) -> Path:
-    """Write a session, or a stretch of it, as a video; returns its path.
+    """Write a session, or those of the animals of one arena, or a stretch, as a video.
 
     Frame k of the video is row k of the tables (of the stretch), shown at its own time, so the rate
     varies: the time t of the video of a whole session is the time t of the tables.
 
     Args:
-        session: the opened session.
+        sessions: the opened session, or those of the animals of one arena over one depth image.
         path: the file to write.
         start_s: start of the stretch, s; None for the beginning.
         stop_s: end of the stretch, s; None for the end.
         slower: slow-motion factor; above 1 is slow motion.
         progress: reports the frames.
 
+    Returns:
+        The path.
+
     Raises:
         SessionError: the session has no depth, the stretch is empty, or there is no encoder.
     """
     h264()
-    with closing(Film(session, scale_mm([session]))) as film:
+    session, alone = sessions[0], len(sessions) == 1
+    with closing(Film(session, scale_mm(sessions), sessions[1:])) as film:
         end = float(film.time_s[-1]) + 1.0 / film.fps
         low = 0.0 if start_s is None else max(start_s, 0.0)
         high = end if stop_s is None else min(stop_s, end)
@@ -177,8 +182,9 @@ def write_session(
         first, last = np.searchsorted(film.time_s, np.array([low, high]) - 1e-6)
         rows = range(first, last) or [film.row_at(low)]  # in a gap, the frame before the gap
         after_s = film.time_s[rows] - low
-        near = start_s is not None or stop_s is not None
-        cell = Cell(film, low, high, session.name, 0 if near else None)
+        near = alone and (start_s is not None or stop_s is not None)
+        title = session.name if alone else arena_name(session)
+        cell = Cell(film, low, high, title, 0 if near else None)
         view = film.whole_view()
         size = (480, 480) if near else _fitted(view.width, view.height, (_WHOLE_PX, _WHOLE_PX))
         _write(path, film.fps, after_s, slower, lambda t: cell.image(t, size), progress)
@@ -186,7 +192,7 @@ def write_session(
 
 
 def write_clips(
-    sessions: Sequence[tuple[Session, str]],
+    arenas: Sequence[tuple[Sequence[Session], str]],
     path: Path,
     actions: Sequence[str] = (),
     *,
@@ -197,7 +203,8 @@ def write_clips(
     """Write clips of actions, or whole sessions, in a grid as one video; returns its path.
 
     Args:
-        sessions: each opened session and its group, "" for none. Groups are next to each other.
+        arenas: each opened session, or those of the animals of one arena, and its group, "" for
+            none. Groups are next to each other.
         path: the file to write.
         actions: words, or the beginnings of words (rear includes rear_supported); () shows the
             whole sessions.
@@ -210,14 +217,14 @@ def write_clips(
     """
     h264()
     with ExitStack() as stack:
-        top_mm = scale_mm([session for session, _ in sessions])
+        sessions = [session for some, _ in arenas for session in some]
+        top_mm = scale_mm(sessions)
         blocks: dict[str, list[Cell]] = {}
-        for session, group in sessions:
-            blocks.setdefault(group, []).extend(
-                _cells(stack.enter_context(closing(Film(session, top_mm))), actions)
-            )
+        for (first, *others), group in arenas:
+            film = stack.enter_context(closing(Film(first, top_mm, others)))
+            blocks.setdefault(group, []).extend(_cells(film, actions))
         if not any(blocks.values()):
-            known = sorted({word for session, _ in sessions for word in session.bouts["action"]})
+            known = sorted({word for session in sessions for word in session.bouts["action"]})
             raise SessionError(
                 f"no bout is named {' or '.join(actions)} in {counted(len(sessions), 'session')}; "
                 f"named are {', '.join(map(str, known)) or 'none'}"
@@ -278,7 +285,8 @@ def _cells(film: Film, actions: Sequence[str]) -> list[Cell]:
     """The bouts of some actions in a session, or the whole session without actions."""
     end = float(film.time_s[-1]) + 1.0 / film.fps
     if not actions:
-        return [Cell(film, 0.0, end, film.session.name)]
+        several = len(film.animals) > 1
+        return [Cell(film, 0.0, end, arena_name(film.session) if several else film.session.name)]
     found = []
     for k, animal in enumerate(film.animals):
         for bout in animal.bouts.to_dict("records"):

@@ -409,6 +409,7 @@ PALETTE = (
     "#44BB99",
     "#882255",
 )
+_ANIMALS = ("#EE7733", "#33BBEE", "#EE3377", "#0077BB")
 _OWN = {
     "walk": "#4477AA",
     "run": "#CCBB44",
@@ -442,3 +443,12 @@ def action_colours(words: Sequence[str]) -> dict[str, str]:
             chosen[word] = _OWN[word]
     left = cycle([colour for colour in PALETTE if colour not in chosen.values()] or PALETTE)
     return {word: chosen.get(word) or next(left) for word in words}
+
+
+def individual_colours(names: Sequence[str]) -> dict[str, str]:
+    """The colour of each animal of an arena, as #rrggbb.
+
+    Args:
+        names: of all animals, in the order of the arena.
+    """
+    return dict(zip(names, cycle(_ANIMALS), strict=False))

@@ -161,7 +161,7 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="nwb, boris, dlc (or deeplabcut), movement, sleap, points, csv, xlsx or video.",
+            help="nwb, boris, dlc (deeplabcut), movement, sleap, points, mabe, csv, xlsx or video.",
         ),
     ],
     out: Annotated[
@@ -197,8 +197,13 @@ def export(
         float, typer.Option("--slower", metavar="N", help="Video: slow-motion factor.")
     ] = 1.0,
 ) -> None:
-    """Export sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, points, CSV, Excel or a video."""
-    from liex_lab.exchange import export as job
+    """Export sessions as NWB, BORIS, DeepLabCut, movement, SLEAP, points, CSV, Excel or a video.
+
+    Sessions of the animals of one arena become individuals of one file.
+    """
+    from liex_lab.exchange.export import ALIASES, TOGETHER
+    from liex_lab.exchange.export import export as job
+    from liex_lab.sessions.individuals import by_arena
 
     if to == "video":
         if points:
@@ -221,9 +226,10 @@ def export(
         raise typer.BadParameter(
             "actions, groups and times are chosen for `--to video`; the other formats hold all"
         )
-    for place in places:
-        path = job(liex_lab.Session.open(place), to, out, overwrite=overwrite, points=points)
-        echo(f"export: {path}")
+    sessions = [liex_lab.Session.open(place) for place in places]
+    joint = ALIASES.get(to, to) in TOGETHER
+    for some in by_arena(sessions) if joint else [[one] for one in sessions]:
+        echo(f"export: {job(some, to, out, overwrite=overwrite, points=points)}")
 
 
 # The command `liex show`: a session's replay in Rerun, optionally with full depth images.

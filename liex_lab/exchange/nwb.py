@@ -1,8 +1,9 @@
 """Neurodata Without Borders (NWB) file: poses by the extension ndx-pose, rotations, actions, gaps.
 
-One animal per file. NWB has no type for rotations: each joint has a TimeSeries of rotation vectors,
-rad. Actions and gaps are time intervals. Times are true times, s since the session's beginning,
-which NWB requires with a time zone.
+One animal per file; the files of the others in its arena are named in `notes`, and the
+interactions of all are in each. NWB has no type for rotations: each joint has a TimeSeries of
+rotation vectors, rad. Actions, interactions and gaps are time intervals. Times are true times, s
+since the session's beginning, which NWB requires with a time zone.
 
 Species, sex and age are fields of NWB's Subject. Group, cage and batch have no field in NWB or in
 any extension that archives accept. They are in the subject's description (which DANDI displays),
@@ -26,6 +27,7 @@ from liex_lab.errors import SessionError
 from liex_lab.exchange.export import hdf5_file
 from liex_lab.sessions import Session
 from liex_lab.sessions.corrections import BoutEdit
+from liex_lab.sessions.individuals import arena_name, individuals_of
 from liex_lab.sessions.session import PULSE, PoseArrays
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import SYNCED
@@ -85,15 +87,49 @@ def _actions(session: Session, estimate: Any, catalogue: Any, observed: Any) -> 
     return table
 
 
-def _intervals(name: str, description: str, spans: NDArray[Any], **more: list[str]) -> Any:
-    """A table of spans (m, 2) s, and further columns."""
+def _intervals(
+    name: str, description: str, spans: NDArray[Any], **more: tuple[str, list[Any]]
+) -> Any:
+    """A table of spans (m, 2) s, and further columns: their description and values."""
     table = pynwb.epoch.TimeIntervals(name=name, description=description)
-    for column in more:
-        table.add_column(column, "why")
+    for column, (what, _) in more.items():
+        table.add_column(column, what)
     for k, (start, stop) in enumerate(spans.tolist()):
-        values = {column: texts[k] for column, texts in more.items()}
+        values = {column: held[k] for column, (_, held) in more.items()}
         table.add_row(start_time=start, stop_time=stop, check_ragged=False, **values)
     return table
+
+
+def _interactions(session: Session) -> Any:
+    """What the animals of the arena did to each other; None for one animal."""
+    if not session.has("interactions.parquet"):
+        return None
+    found = session.interactions
+    described = session.columns.query("table == 'interactions'").set_index("name")["meaning"]
+    return _intervals(
+        "interactions",
+        "what one animal of the arena did to another: half-open intervals",
+        found[["start_s", "stop_s"]].to_numpy(float),
+        **{
+            name: (str(described[name]), found[name].tolist())
+            for name in ("agent", "target", "action", "score", "directed")
+        },
+    )
+
+
+def _in_one_arena(session: Session) -> dict[str, str]:
+    """The other animals of the arena, each with the file and identifier of its export."""
+    named = {one: f"{arena_name(session)}-{one}" for one in individuals_of(session)}
+    del named[session.metadata["individual"]]
+    return {
+        f"together with {one}": f"{name}.nwb, identifier {_identifier(session, name)}"
+        for one, name in named.items()
+    }
+
+
+def _identifier(session: Session, name: str) -> str:
+    """Of the file of the session's recording with this session name."""
+    return str(uuid5(NAMESPACE_URL, f"{name}-{session.metadata['input']['sha256']}"))
 
 
 def observed_spans(poses: PoseArrays) -> NDArray[np.float64]:
@@ -146,12 +182,12 @@ def build(session: Session) -> pynwb.NWBFile:
     """
     about = session.metadata
     version = about["versions"].get("liex_lab", "unknown")
-    facts = {"individual": about["individual"], **about["subject"]}
+    facts = {"individual": about["individual"], **about["subject"], **_in_one_arena(session)}
     made = pynwb.NWBFile(
         session_description=(
             f"3D skeleton and actions of one {about['animal']['name']}, from a depth recording"
         ),
-        identifier=str(uuid5(NAMESPACE_URL, f"{session.name}-{about['input']['sha256']}")),
+        identifier=_identifier(session, session.name),
         session_start_time=_start(session),
         session_id=session.name,
         subject=_subject(session),
@@ -185,11 +221,12 @@ def build(session: Session) -> pynwb.NWBFile:
         "gaps",
         "frames that are missing or without a pose",
         lacking[["start_s", "stop_s"]].to_numpy(float),
-        reason=[str(reason) for reason in lacking["reason"]],
+        reason=("why", [str(reason) for reason in lacking["reason"]]),
     )
     when = "when actions could be named"
     observed = _intervals("observed", when, observed_spans(poses)) if len(gaps) else None
-    for table in (_actions(session, estimate, catalogue, observed), gaps, observed):
+    together = _interactions(session)
+    for table in (_actions(session, estimate, catalogue, observed), gaps, observed, together):
         if table is not None and len(table):
             made.add_time_intervals(table)
     return made

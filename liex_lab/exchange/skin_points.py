@@ -4,8 +4,10 @@ Each point follows the session's own body in the pose of its frame, in the arena
 Frames without a pose are NaN. `liex_lab.body.skin_points` gives the equations.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +19,7 @@ from liex_lab.runtime.memory import blocks
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.evidence import provenance_of, skeleton_of, track_of
+from liex_lab.sessions.individuals import individuals_of
 from liex_lab.sessions.rrd_scene import body_of
 from liex_lab.sessions.session import PoseArrays
 from liex_lab.tables.rows import NEAR, columns_of, nearness, repeated
@@ -65,16 +68,27 @@ def derived_points(session: Session) -> PoseArrays:
     )
 
 
-def write_points(session: Session, path: Path) -> None:
+def write_points(sessions: Sequence[Session], path: Path) -> None:
     """Write a new folder: points.parquet, and mabe.csv in pixels in the form of MABe's tracking.
 
     Args:
-        session: the session.
+        sessions: of the animals of one arena.
         path: the folder to write.
 
     Raises:
         LiexError: no points are stated for this animal.
     """
+    tables, tracks = zip(*map(_points_of, sessions), strict=True)
+    about = provenance_of(sessions[0], skeleton_of(sessions[0])).table_metadata() | {
+        "joints": "none: points derived from the fitted body, on its skin"
+    }
+    path.mkdir()
+    write_table(path / "points.parquet", POINTS, tables, about)
+    write_csv(pd.concat(tracks), path / "mabe.csv")
+
+
+def _points_of(session: Session) -> tuple[dict[str, Any], pd.DataFrame]:
+    """The columns of the table `points` of one animal, and its rows of MABe's tracking."""
     skeleton, poses = skeleton_of(session), derived_points(session)
     names, n_frames = [*poses.joints], len(poses.time_s)
     xyz, sd, likelihood = poses.xyz_mm, poses.sd_mm, poses.likelihood
@@ -100,16 +114,11 @@ def write_points(session: Session, path: Path) -> None:
         "likelihood": likelihood.ravel(),
         "derived": np.tile(np.array(names) != TAIL, n_frames),
     }
-    about = provenance_of(session, skeleton).table_metadata() | {
-        "joints": "none: points derived from the fitted body, on its skin"
-    }
-    path.mkdir()
-    write_table(path / "points.parquet", POINTS, [columns], about)
     mabe = [one.mabe or one.name for one in points_of(skeleton)]
     tracking = {
         "video_frame": np.repeat(poses.frame_index, len(mabe)),
-        "mouse_id": 1,
+        "mouse_id": individuals_of(session).index(poses.individual) + 1,
         "bodypart": np.tile(mabe, n_frames),
         **{axis: poses.uv_px[..., k].ravel() for k, axis in enumerate("xy")},
     }
-    write_csv(pd.DataFrame(tracking), path / "mabe.csv")
+    return columns, pd.DataFrame(tracking)

@@ -2,8 +2,9 @@
 
 The background is the farthest depth that keeps recurring in each pixel (see `scene.background`). An
 animal that hardly moves would become part of it, but the segmentation knows the depth behind such
-an animal. In every frame, the boxes around the two likeliest objects are kept as the camera read
-them, unread pixels as 0; outside of them a kept image shows the background. A frame without any
+an animal. In every frame, the boxes around the two likeliest objects, or around as many as animals
+are measured, are kept as the camera read them, unread pixels as 0; outside of them a kept image
+shows the background. A frame without any
 such object is kept whole, so that people can find out why. A box contains the projected joints of
 the object's pose, and a square of 1.4 square roots of its pixels about its centroid, with a margin
 of 15 % of the spine all around:
@@ -53,7 +54,7 @@ ANIMAL = "animal"
 ARENA = "arena"
 ALL = "all"
 NONE = "none"
-N_BOXES = 2  # objects per frame
+N_BOXES = 2  # objects per frame, if no more animals are measured
 _FRAMES = 16  # from which the background is learned
 _REACH = 0.7  # of the square root of an object's pixels, to each side of its centroid
 _MARGIN = 0.15  # of the spine
@@ -234,13 +235,15 @@ def boxes_around(observations: Observations, origin: Provenance) -> Boxes:
         origin: camera, its pose, and the animal's length.
 
     Returns:
-        (n, 2, 4) int16 left, top, right, bottom, px; all 0 for no object.
+        (n, K, 4) int16 left, top, right, bottom, px, of K = 2 or as many objects as animals are
+            measured; all 0 for no object.
     """
     camera = origin.camera
     into = origin.T_arena_camera.inverse()
     spine_mm = _spine_mm(origin)
-    found = np.zeros((len(observations), N_BOXES, 4), np.int16)
-    for k in range(N_BOXES):
+    n_boxes = max(N_BOXES, observations.known.shape[1] // 2)
+    found = np.zeros((len(observations), n_boxes, 4), np.int16)
+    for k in range(n_boxes):
         h = 2 * k  # the other hypothesis of each object is the same one reversed
         rows = np.flatnonzero(observations.known[:, h] & (observations.n_px[:, h] > 0))
         if not len(rows):

@@ -38,7 +38,7 @@ from liex_lab.geometry import SE3, so3
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.depth_kernels import rvl_message
 from liex_lab.scene.scene import Scene
-from liex_lab.sessions.cutouts import N_BOXES, N_WINDOWS, Boxes, window_around, windows
+from liex_lab.sessions.cutouts import N_WINDOWS, Boxes, window_around, windows
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
@@ -77,12 +77,11 @@ class DepthColumns:
         self._n_bytes = 0
         self._introduced: set[str] = set()
         self._shown: set[str] = set()  # entities that show an image of earlier frames
+        self._resumed = False
 
     def resume(self) -> None:
         """Continue another file, whose last visible entities are unknown."""
-        cut_out = self._origin.background is not None
-        cutouts = (cutout_entity(k, n) for k in range(N_BOXES) for n in range(N_WINDOWS))
-        self._shown = set(cutouts if cut_out else (DEPTH, NOISY))
+        self._resumed = True
 
     def take(
         self,
@@ -133,8 +132,14 @@ class DepthColumns:
         self._n_bytes = 0
         if not waiting:
             return 0
-        for k in range(len(waiting[0].windows)):
+        n_cutouts = len(waiting[0].windows)
+        for k in range(n_cutouts):
             self._send_lens(stream, k, waiting)
+        if self._resumed:
+            self._resumed = False
+            cutouts = (cutout_entity(k, n) for k in range(n_cutouts) for n in range(N_WINDOWS))
+            cut_out = self._origin.background is not None
+            self._shown = set(cutouts if cut_out else (DEPTH, NOISY))
         entities = sorted(self._shown.union(*(image.parts for image in waiting)))
         for entity in entities:
             # its images, and the frame from which it shows none

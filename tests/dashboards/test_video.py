@@ -16,6 +16,7 @@ from liex_lab.errors import PlaceError, SessionError
 from liex_lab.exchange import export
 from liex_lab.exchange.boris import project
 from liex_lab.sessions import Session
+from tests.sessions.pair import NAMES, write_pair
 from tests.sessions.walking_mouse import FLOOR_MM, WalkingMouse, steady, write
 
 GAP = np.delete(steady(2.0), slice(20, 26))
@@ -86,6 +87,30 @@ def test_the_nose_is_drawn_where_the_table_says(session):
     red = (shown.astype(int) - [238, 102, 119]).__abs__().sum(axis=-1) < 60
     y, x = np.nonzero(red)
     assert np.hypot(x.mean() + 0.5 - place[0], y.mean() + 0.5 - place[1]) < 3.0
+
+
+def test_animals_of_one_arena_are_shown_over_one_depth_image_in_their_colours(tmp_path):
+    pair = write_pair(tmp_path, 1.0)
+    with closing(Film(pair[0], 80.0, pair[1:])) as film:
+        view = film.whole_view()
+        shown = film.image(0.5, view, (6 * view.width, 6 * view.height), "").astype(int)
+        at = [6.0 * (uv[15].mean(axis=0) + 0.5 - [view.left, view.top]) for uv in film.uv]
+        events = pair[0].interactions.query("target != ''")
+        assert len(events)
+        for event in events.to_dict("records"):
+            said = (event["agent"], event["target"], event["action"])
+            assert said in film.interactions_at(event["start_s"])
+            assert said not in film.interactions_at(event["stop_s"])
+    for name, colour, (x, y) in zip(NAMES, ((238, 119, 51), (51, 187, 238)), at, strict=True):
+        near = shown[int(y) - 12 : int(y) + 12, int(x) - 12 : int(x) + 12]
+        assert (abs(near - colour).sum(axis=-1) < 40).any(), name
+    paths = [one.path for one in pair]
+    video = export_video(paths)
+    assert video == tmp_path / "pair.mp4"
+    np.testing.assert_allclose(shown_at(video), pair[0].frames["time_s"], atol=1e-4)
+    assert export_video(paths, start_s=0.2, stop_s=0.3).name == "pair_from_0.20s_to_0.30s.mp4"
+    alone = write(tmp_path / "circle.liex", WalkingMouse(steady(1.0)))
+    assert export_video([*paths, alone.path], tmp_path).name == "sessions.mp4"
 
 
 def test_heights_are_counted_from_the_floor(session):

@@ -266,5 +266,6 @@ def test_a_session_without_any_pose_can_be_exported(tmp_path):
         WalkingMouse(steady(0.5), lost=tuple(range(15))),
         session_start_time="2026-08-21T10:00:00+02:00",
     )
-    for target in TARGETS.keys() - {"xlsx"}:  # a table that takes longer than all others
+    # a workbook takes longer than all others, and mabe is of several animals
+    for target in TARGETS.keys() - {"xlsx", "mabe"}:
         assert export(session, target, tmp_path).exists()

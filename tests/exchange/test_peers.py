@@ -7,6 +7,7 @@ from movement.io import load_poses
 from movement.validators.datasets import ValidPosesInputs
 
 from liex_lab.exchange import export
+from tests.sessions.pair import NAMES, write_pair
 
 
 def test_movement_takes_the_netcdf_for_its_own(session, tmp_path):
@@ -55,3 +56,22 @@ def test_movement_and_sleap_io_read_derived_points(session, tmp_path):
     assert list(dlc["keypoints"].values) == list(data["keypoints"].values)
     labels = sleap_io.load_file(str(export(session, "sleap", tmp_path, points=True)))
     assert [node.name for node in labels.skeletons[0].nodes] == list(data["keypoints"].values)
+
+
+def test_movement_and_sleap_io_read_the_animals_of_an_arena_as_individuals(tmp_path):
+    pair = write_pair(tmp_path)
+    ValidPosesInputs.validate(
+        xarray.load_dataset(export(pair, "movement", tmp_path), engine="h5netcdf")
+    )
+    dlc = load_poses.from_dlc_file(export(pair, "dlc", tmp_path) / "poses_2d.csv")
+    path = export(pair, "sleap", tmp_path)
+    sleap, labels = load_poses.from_sleap_file(path), sleap_io.load_file(str(path))
+    assert [track.name for track in labels.tracks] == list(NAMES)
+    for k, session in enumerate(pair):
+        uv_px = session.pose_arrays().uv_px
+        np.testing.assert_allclose(labels.numpy()[:, k], uv_px, rtol=1e-6)
+        for data in (dlc, sleap):
+            own = data["position"].sel(individuals=NAMES[k])
+            np.testing.assert_allclose(
+                own.transpose("time", "keypoints", "space"), uv_px, rtol=1e-6
+            )

@@ -109,6 +109,17 @@ def test_a_box_holds_the_joints_and_the_animals_pixels_and_lies_in_the_picture()
     np.testing.assert_array_equal(np.concatenate(parts), boxes)
 
 
+def test_each_of_three_measured_animals_has_a_box() -> None:
+    three = Observations.empty(MOUSE.skeleton, MOUSE.times_ns, 3)
+    for name, values in vars(three).items():
+        if name != "skeleton" and values.ndim > 1 and name != "objects":
+            own = getattr(SEEN, name)
+            values[:] = own[:, [0, 1, 0, 1, 0, 1]]
+    boxes = boxes_around(three, MOUSE.provenance())
+    one = boxes_around(SEEN, MOUSE.provenance())
+    np.testing.assert_array_equal(boxes, one[:, [0, 0, 0]])
+
+
 def test_a_kept_picture_is_as_read_in_its_box_and_the_still_scene_elsewhere(
     session: Session,
 ) -> None:
