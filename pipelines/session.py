@@ -375,7 +375,8 @@ def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
     plan's differs from the metadata's.
     """
     recorded = str(opened.metadata.get("subject_id", ""))
-    found = study.find_subject(path, recorded)
+    several = len(durable.named_files(path)) > 1
+    found = study.find_subject(path.with_name(opened.name) if several else path, recorded)
     in_metadata = found.origin == "metadata"
     stated = plan.session.subject_id
     if stated is None:
