@@ -173,7 +173,7 @@ def _apply(raw: Session, log: corrections.Log, folder: Path) -> corrections.Log:
         written = {
             name: table for name, table in written.items() if name not in ("kinematics", "zones")
         }
-    results.write_measured(folder, written, (*behaviour.vocabulary.columns, *together))
+    results.write_measured(folder, written, (*behaviour.columns, *together))
     facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}
     layout = replay_blueprint({**raw.metadata, **facts})
     rrd.ReplayWriter(folder / corrections.REPLAY, origin, layout, corrected=True).finish(

@@ -95,11 +95,15 @@ def test_a_recording_in_parts_gives_the_tables_of_the_whole(
     for folder, cuts in ((whole, ()), (split, (9, 22))):
         folder.mkdir()
         write_mcap_parts(folder, images, cuts, TIMES_NS, mouse.camera)
-    at_once = run((whole / "cam1_0.mcap").rename(whole / "cam1.mcap"), tmp_path / "once")
+    light = ["light.on=07:00", "light.off=19:00", "light.zone=Europe/Berlin"]
+    plan = Plan.load("mouse").with_settings(light)
+    single = (whole / "cam1_0.mcap").rename(whole / "cam1.mcap")
+    at_once = measure(single, plan, tmp_path / "once")
     parts, out = split / "cam1_*.mcap", tmp_path / "parts"
     with pytest.raises(SessionError, match="without a word"):
-        run(parts, out, InTurn(accident_after=2))
-    again = run(parts, out)
+        measure(parts, plan, out, pool=InTurn(accident_after=2))
+    again = measure(parts, plan, out)
+    assert list(Session.open(again).hours["clock"]) == ["2025-10-09T10:53:20+02:00"]
     assert tables_of(again) == tables_of(at_once)
     assert depth_messages(again) == depth_messages(at_once)
     assert linked_recording(Session.open(again)) == str(parts)
