@@ -5,7 +5,6 @@ from datetime import datetime, timedelta
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..units import counted
 from .animals import Array, SessionAnimal
 from .style import BLUE, INK, LEFT_MM, LINE, RIGHT_MM, TWO_COLUMNS_MM, name_rows, one_panel
 
@@ -32,8 +31,8 @@ def actogram(animal: SessionAnimal) -> Figure | None:
     figure, axes = one_panel(
         (TWO_COLUMNS_MM, height + 17.0),
         (LEFT_MM, 8.0, TWO_COLUMNS_MM - LEFT_MM - RIGHT_MM, height),
-        f"Actogram, {animal.label}, {counted(n_days, 'day')}, each beside the next; bars: activity "
-        f"per 10 min, up to {0.1 * top:.2g} cm/s; line: share of the hour in sleep by immobility",
+        f"Actogram, {animal.label}; bars: speed in 10 min, up to {0.1 * top:.2g} cm/s; line: share "
+        "of the hour in sleep by immobility",
     )
     start, stop = (
         since_midnight_h + hours[name].to_numpy(float) / 3600.0 for name in ("start_s", "stop_s")
@@ -46,7 +45,8 @@ def actogram(animal: SessionAnimal) -> Figure | None:
 
         def place(at: Array, shift: int = shift) -> tuple[Array, Array]:
             """Columns, h, and rows from the top, of times of day in one half of the figure."""
-            return at % 24.0 + 24.0 * shift, at // 24.0 - shift
+            row = at // 24.0 - shift
+            return at % 24.0 + 24.0 * shift, np.where(row < 0, np.nan, row)
 
         x, row = place(start)
         axes.bar(
