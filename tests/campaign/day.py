@@ -26,13 +26,12 @@ _VIRTUAL = "synthetic:walk?seed=5&frames=900&sensor=primesense-qvga"
 _START_NS = 1_772_434_800_000_000_000  # 2 March 2026, 07:00 UTC
 _STRETCH = 150  # frames
 _ACTIVE = {True: 0.15, False: 0.7}  # share of the stretches in light and in dark
-_LIGHT = ("light.on=07:00", "light.off=19:00", "light.zone=UTC")
 
 
 def make_day(folder: Path, minutes: float, seed: int) -> int:
-    """Write cam1_00.mcap ... of a day of some minutes, whose hours are shortened alike.
+    """Write cam1_00.mcap ... of a day of some minutes from 07:00 on, light in its first half.
 
-    Times are true, so a day of fewer than 1440 minutes is simply shorter. Returns its frames.
+    Returns the number of its frames.
     """
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
@@ -60,9 +59,11 @@ def make_day(folder: Path, minutes: float, seed: int) -> int:
     return number
 
 
-def measure(folder: Path, kill_after_s: float) -> dict[str, Any]:
+def measure(folder: Path, minutes: float, kill_after_s: float) -> dict[str, Any]:
     """`liex run` on the day's files, killed once and run again, with its memory every 5 s."""
-    setting = [word for one in _LIGHT for word in ("--set", one)]
+    off_h, off_min = divmod(round(7 * 60 + minutes / 2), 60)
+    light = ("light.on=07:00", f"light.off={off_h:02}:{off_min:02}", "light.zone=UTC")
+    setting = [word for one in light for word in ("--set", one)]
     command = ["run", folder / "cam1_*.mcap", "--out", folder, "--no-depth", *setting]
     curve: list[tuple[float, float]] = []
     began, codes = time.monotonic(), []
@@ -106,4 +107,4 @@ def day(folder: Path, minutes: float, kill_after_s: float, seed: int) -> dict[st
     if not (folder / f"cam1_{N_FILES - 1:02}.mcap").is_file():
         n = make_day(folder, minutes, seed)
         print(json.dumps({"written_frames": n}), file=sys.stderr, flush=True)
-    return measure(folder, kill_after_s)
+    return measure(folder, minutes, kill_after_s)
