@@ -310,7 +310,7 @@ def _apply(
             name: table for name, table in written.items() if name not in ("kinematics", "zones")
         }
     more = schema.INTERACTIONS if raw.has("interactions.parquet") else ()
-    results.write_measured(folder, written, (*behaviour.vocabulary.columns, *more))
+    results.write_measured(folder, written, (*behaviour.columns, *more))
     facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}
     if problems != raw.metadata["problems"]:
         facts["problems"] = problems

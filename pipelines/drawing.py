@@ -13,6 +13,7 @@ from liex_lab.errors import LiexError, SessionError, refuse
 from liex_lab.plan import Plan
 from liex_lab.recordings.depth_kernels import to_millimetres
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.durable import is_there
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, cutouts, evidence, rrd
 from liex_lab.sessions.individuals import arena_name, by_arena
@@ -228,7 +229,7 @@ def recording_of(
             f"{session.path} does not link to its recording, like sessions of earlier versions; "
             "name it with --recording"
         )
-    if not where.startswith("synthetic:") and not Path(where).exists():
+    if not where.startswith("synthetic:") and not is_there(where):
         raise SessionError(
             f"full depth images are missing: the recording of {session.path.name} is not at "
             f"{where} any more; name it with --recording"

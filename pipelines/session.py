@@ -31,6 +31,7 @@ from liex_lab.dashboards.report.report import write_views
 from liex_lab.actions import ethogram, timeline, vocabulary
 from liex_lab.behaviour import summary
 from liex_lab.behaviour.bouts import recognise
+from liex_lab.behaviour.days import Light
 from liex_lab.behaviour.interactions import Interactions
 from liex_lab.catalog import DEMO, find_sample
 from liex_lab.errors import PlanError, RecordingError
@@ -375,7 +376,8 @@ def _check_subject(opened: Recording, path: Path, plan: Plan) -> list[str]:
     plan's differs from the metadata's.
     """
     recorded = str(opened.metadata.get("subject_id", ""))
-    found = study.find_subject(path, recorded)
+    several = len(durable.named_files(path)) > 1
+    found = study.find_subject(path.with_name(opened.name) if several else path, recorded)
     in_metadata = found.origin == "metadata"
     stated = plan.session.subject_id
     if stated is None:
@@ -555,12 +557,14 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
 
     Raises:
         ModelError: there is no such recogniser.
-        PlanError: the recogniser was made for another skeleton.
+        PlanError: the recogniser was made for another skeleton, or [light] is stated and the time
+            of day of the recording is unknown.
         SessionError: there is not enough disk space.
     """
     build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
 
     origin = build_provenance(fitted.recording, fitted.plan, fitted.tracker, progress)
+    Light.of(fitted.plan.light.model_dump(), origin.session_start_time)
     needed = session_bytes(
         fitted.recording, fitted.plan, fitted.tracker.spine_mm, origin.floor_distance_mm
     )
@@ -686,7 +690,8 @@ def measure_behaviour(
     """
     recogniser = build_recogniser(plan, origin.skeleton)
     rules = build_rules(plan)
-    around = replace(build_surroundings(origin), seams=seams)
+    light = Light.of(plan.light.model_dump(), origin.session_start_time)
+    around = replace(build_surroundings(origin), seams=seams, light=light)
     moved = summary.kinematics_of_rows(rows, rules, around, allocate)
     named: dict[str, Any] = {}
     notes: dict[str, Any] = {}

@@ -99,6 +99,9 @@ CHANGED = {
         "--action rear_supported --from 40 --to 41.5": "--action pause --from 0 --to 0.3",
         "CORRECTED.boris": "forms/mouse_walk.boris",
     },
+    "docs/howto/day.md": {
+        "liex doctor 'day1": "mkdir day1; cp recording.mcap day1/cam1_0.mcap; liex doctor 'day1"
+    },
     "docs/howto/figures.md": {
         "A.liex B.liex": "study/derivatives/liex-lab/sub-m0[12]*/*/behav",
         "--action rear_supported": "--action walk",

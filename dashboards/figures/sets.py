@@ -21,7 +21,7 @@ from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
-from . import groups, places, social, times
+from . import days, groups, places, social, times
 from .animals import DepthImages, SessionAnimal, keeps_depth, session_animals
 from .style import FORMATS, drawing, image_bytes, on_page
 
@@ -38,6 +38,7 @@ OF_SESSION: dict[str, tuple[str, Callable[[SessionAnimal], Figure | None]]] = {
     "arena": ("heights of the arena above its floor", lambda animal: _arena(animal.session)),
     "time_budget": ("share of the time in each action", times.time_budget),
     "activity": ("shares of the actions over the session", times.activity),
+    "actogram": ("activity by the time of day, in light and dark", days.actogram),
     "transitions": ("what follows upon what, against chance", times.transitions),
     "interactions": ("who did what to whom, number and time", social.interaction_matrix),
     "network": ("the group of animals and their interactions", social.interaction_network),

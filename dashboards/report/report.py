@@ -221,7 +221,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 _TABLES = (
     *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
-    *("summary", "transitions", "activity", "zones", "events"),
+    *("summary", "transitions", "activity", "hours", "rhythm", "zones", "events"),
     *("crossings", "interactions", "interaction_totals"),
 )
 
@@ -286,6 +286,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         video=None if video is None else video.name,
         unresolved=about.get("unresolved_actions") or {},
         summary=summary_rows(session, words),
+        rhythm=rhythm_rows(session),
         budget=budget_rows(session, words),
         across_gaps=ethogram.ACROSS_GAPS,
         arena=session.arena,
@@ -398,10 +399,26 @@ def summary_rows(session: Session, words: list[str]) -> list[tuple[str, str, str
         *(f"{word}_{what}" for word in budgeted for what, _ in _BUDGET),
     }
     elsewhere |= {f"zone_{zone.name}_{what}" for zone in session.zones for what in ("s", "share")}
+    return _rows_of(row, [name for name in row.index if name not in elsewhere], described)
+
+
+def rhythm_rows(session: Session) -> list[tuple[str, str, str, str]]:
+    """The known measures of light and dark, as `summary_rows`; [] without light in the plan."""
+    if not session.has("rhythm.parquet"):
+        return []
+    described = session.columns[session.columns["table"] == "rhythm"].set_index("name")
+    row = session.rhythm.iloc[0]
+    known = [name for name in row.index[2:-1] if np.isfinite(row[name])]
+    lacking = [("not measured", "", "", row["not_measured"])] if row["not_measured"] else []
+    return _rows_of(row, known, described) + lacking
+
+
+def _rows_of(
+    row: "pd.Series[Any]", names: list[str], described: pd.DataFrame
+) -> list[tuple[str, str, str, str]]:
+    """Columns of a table of one row as (title, value, unit, meaning)."""
     found = []
-    for name in session.summary.columns:
-        if name in elsewhere:
-            continue
+    for name in names:
         kept = str(described.loc[name, "unit"] or "")
         value, unit = shown(row[name], kept)
         share = name.endswith("_share")

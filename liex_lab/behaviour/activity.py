@@ -19,6 +19,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from liex_lab.behaviour.bouts import MouseRules, tidy
+from liex_lab.behaviour.days import Light
 from liex_lab.behaviour.kinematics import segments
 from liex_lab.behaviour.statistics import false_discovery
 from liex_lab.scene.scene import UNKNOWN, Arena
@@ -338,12 +339,14 @@ class Surroundings:
         surface_z_mm: height of the water's surface above the floor, mm; None if absent or unknown.
         seams: frame indices of the camera at which a person's exchange of head and tail begins or
             ends; nothing is measured across one, as across a gap.
+        light: the room's light; None if unknown.
     """
 
     arena: Arena = UNKNOWN
     zones: Sequence[str] = field(default=())
     surface_z_mm: float | None = None
     seams: Sequence[int] = field(default=())
+    light: Light | None = None
 
 
 def surface_height_mm(floor_distance_mm: float, optics: dict[str, object]) -> float | None:

@@ -31,10 +31,20 @@ from liex_lab.behaviour.activity import (
 )
 from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts, measure_bouts, of_known
+from liex_lab.behaviour.days import Light, activity_by_hour, rhythm
 from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
-from liex_lab.tables.schema import BEHAVIOUR, GAPS, Vocabulary, empty_table, rears_of, to_pandas
+from liex_lab.tables.schema import (
+    BEHAVIOUR,
+    GAPS,
+    Column,
+    Vocabulary,
+    empty_table,
+    rears_of,
+    table_columns,
+    to_pandas,
+)
 from liex_lab.tracking.track import DOUBTFUL, ends_of
 
 if TYPE_CHECKING:
@@ -58,6 +68,7 @@ class Behaviour:
         rules: the thresholds.
         vocabulary: determines the columns.
         actions: word of the ethogram -> its definition.
+        days: the tables of light and dark, `days.TABLES`; empty if the plan states no light.
     """
 
     kinematics: pd.DataFrame
@@ -69,17 +80,24 @@ class Behaviour:
     rules: MouseRules
     vocabulary: Vocabulary
     actions: Mapping[str, str] = field(default_factory=dict)
+    days: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by its name."""
-        return {name: getattr(self, name) for name in BEHAVIOUR}
+        return {name: getattr(self, name) for name in BEHAVIOUR} | dict(self.days)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The columns of the tables."""
+        of_days = [column for name in self.days for column in table_columns(name)]
+        return (*self.vocabulary.columns, *of_days)
 
     def for_session(self) -> dict[str, Any]:
         """The arguments for closing a session: `writer.close(**behaviour.for_session())`."""
         return {
             "results": self.tables,
-            "columns": self.vocabulary.columns,
+            "columns": self.columns,
             "actions": self.actions,
             "record": {"rules": self.rules.model_dump()},
         }
@@ -149,6 +167,10 @@ def measure(
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
     words = Vocabulary(tuple(actions), tuple(around.zones), kind_of(moved))
     gaps = empty_table(GAPS) if gaps is None else gaps
+    of_days = {}
+    if around.light is not None:
+        hours = activity_by_hour(moved, around.light, observed_hold(moved))
+        of_days = {"hours": hours, "rhythm": rhythm(hours, around.light)}
     return Behaviour(
         moved,
         named,
@@ -159,6 +181,7 @@ def measure(
         rules,
         words,
         actions,
+        of_days,
     )
 
 
@@ -216,7 +239,8 @@ def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:
     by_hand = flips[flips["source"] == HUMAN]
     seams = ends_of(zip(by_hand["start_frame"], by_hand["stop_frame"], strict=True))
     zones = [zone.name for zone in session.zones]
-    return MouseRules(**stated), Surroundings(session.arena, zones, surface, seams)
+    light = Light.of(about["plan"].get("light") or {}, about.get("session_start_time"))
+    return MouseRules(**stated), Surroundings(session.arena, zones, surface, seams, light)
 
 
 def measure_session(session: SessionTables, rules: MouseRules | None = None) -> Behaviour:

@@ -28,11 +28,12 @@ from liex_lab.cli.options import (
     NamesFile,
     OutFolder,
     PlanName,
-    RecordingPath,
+    RecordingPaths,
     SessionPath,
     Settings,
     TopicName,
     WhichPlan,
+    as_one,
     command_group,
     echo,
     load_plan,
@@ -124,7 +125,7 @@ def demo(out: OutFolder = Path()) -> None:
 
 @app.command(rich_help_panel=START)
 def run(
-    recording: RecordingPath,
+    recordings: RecordingPaths,
     plan: WhichPlan = None,
     out: OutFolder = Path(),
     topic: TopicName = None,
@@ -170,7 +171,7 @@ def run(
     measure = api.run_session if alone else api.run_arenas
     with progress_bar() as progress:
         measured = measure(
-            recording,
+            as_one(recordings),
             chosen if plan else None,
             out,
             settings=() if plan else asked,
@@ -234,7 +235,7 @@ def import_points(
 
 @app.command(rich_help_panel=START)
 def doctor(
-    recording: RecordingPath,
+    recordings: RecordingPaths,
     as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
     fps: Annotated[
         float | None, typer.Option("--fps", help="Frame rate of a recording without timestamps.")
@@ -263,7 +264,7 @@ def doctor(
     options += [word for setting in stated for word in ("--set", setting)]
     with progress_bar() as progress:
         findings = api.examine(
-            recording,
+            as_one(recordings),
             plan=chosen,
             fps=fps,
             topic=topic,

@@ -11,12 +11,20 @@ import typer
 from typer.core import TyperGroup
 
 import liex_lab
-from liex_lab.errors import PlanError, printable
+from liex_lab.errors import PlanError, RecordingError, printable
 
 RecordingPath = Annotated[
     Path,
     typer.Argument(
         metavar="RECORDING", help="A file, a folder, or a virtual recording such as synthetic:walk."
+    ),
+]
+RecordingPaths = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORDING",
+        help="A file, a folder, or a virtual recording such as synthetic:walk; several files, or a "
+        "pattern such as 'cam1_*.mcap', are one recording in parts.",
     ),
 ]
 SessionPath = Annotated[
@@ -65,6 +73,22 @@ RowName = Annotated[
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the numbers to this file.")
 ]
+
+
+def as_one(paths: Sequence[Path]) -> Path:
+    """One path for several files of a recording, as opened by `liex_lab.open_recording`.
+
+    Raises:
+        RecordingError: they are in several folders.
+    """
+    if len(paths) == 1:
+        return paths[0]
+    if len({path.parent for path in paths}) > 1:
+        raise RecordingError(
+            "the files of one recording are expected in one folder, or as a pattern in quotes, "
+            f"such as 'day1/*/cam1.mcap'; got {paths[0]} and {paths[-1]}"
+        )
+    return paths[0].parent / f"{{{','.join(path.name for path in paths)}}}"
 
 
 def region_setting(region: str | None) -> list[str]:

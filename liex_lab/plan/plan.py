@@ -27,6 +27,7 @@ from liex_lab.plan.sections import (
     Estimation,
     Foreground,
     InteractionThresholds,
+    LightSettings,
     RecordingOptions,
     Replay,
     Report,
@@ -68,6 +69,7 @@ class Plan(SettingsTable):
         session: metadata of the animal and the session.
         actions: the action recogniser.
         behaviour: thresholds between behaviours.
+        light: the light of the animal's room, and sleep by immobility.
         interactions: thresholds of interactions between animals.
         replay: contents of the replays.
         report: files written with the report.
@@ -93,6 +95,7 @@ class Plan(SettingsTable):
     session: SessionFacts = SessionFacts()
     actions: Actions = Actions()
     behaviour: BehaviourThresholds = BehaviourThresholds()
+    light: LightSettings = LightSettings()
     interactions: InteractionThresholds = InteractionThresholds()
     replay: Replay = Replay()
     report: Report = Report()

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Iterable
 from datetime import datetime
 from typing import Annotated, Any, ClassVar, Literal, Self
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -18,6 +19,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 Factor = Annotated[float, Field(gt=1e-3, lt=1e3)]
 Corner = Annotated[list[float], Field(min_length=2, max_length=2)]
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+ClockTime = Annotated[str, Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d$")]
 ArenaName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 # names of liex_lab.optics.camera, repeated here because a plan is read before libraries are
 # imported
@@ -523,6 +525,44 @@ class BehaviourThresholds(SettingsTable):
         0.33, description="shorter interruptions of a bout are bridged"
     )
     min_bout_s: NotNegative = Field(0.23, description="shorter bouts are dropped, after bridging")
+
+
+class LightSettings(SettingsTable):
+    """[light]: when the light of the animal's room is on. With on, off and zone, activity by the
+    hour, an actogram, circadian measures and sleep by immobility are made.
+    """
+
+    on: ClockTime | None = Field(None, description="when the light goes on, as '07:00'")
+    off: ClockTime | None = Field(None, description="when it goes off, as '19:00'")
+    zone: str | None = Field(
+        None,
+        description=(
+            "time zone of these times, as 'Europe/Berlin'; 'Etc/GMT-1' is one hour ahead of UTC "
+            "all year round, for a timer without summer time"
+        ),
+    )
+    immobile_s: Positive = Field(
+        40.0, description="sleep by immobility lasts at least so long (Fisher et al. 2012: 40)"
+    )
+    still_mm_s: Positive = Field(
+        2.0, description="an animal is immobile if it moves less from second to second"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        stated = [self.on, self.off, self.zone]
+        if any(stated) and (not all(stated) or self.on == self.off):
+            raise ValueError(
+                "[light] takes on, off and zone together, as on = '07:00', off = '19:00', zone = "
+                "'Europe/Berlin'"
+            )
+        try:
+            ZoneInfo(self.zone or "UTC")
+        except (ZoneInfoNotFoundError, ValueError, OSError):
+            raise ValueError(
+                f"light.zone should be a time zone such as 'Europe/Berlin', got {self.zone!r}"
+            ) from None
+        return self
 
 
 class InteractionThresholds(SettingsTable):

@@ -86,7 +86,8 @@ class StudySession(SettingsTable):
     Attributes:
         animal: id of the animal.
         session: letters and digits, with key-value pairs after them, as in 01_date-20260821.
-        recording: path below the study's folder, or address of a virtual recording.
+        recording: path below the study's folder, or address of a virtual recording; a pattern such
+            as rawdata/m01/cam1_*.mcap is one recording in several files.
         plan: a bundled plan or a path below the study's folder; None uses the study's.
         arena: the animal's arena, if the image shows several; else empty.
         start_time: ISO 8601 with time zone; None uses the recording's.
@@ -192,7 +193,7 @@ class PlannedSession:
     @property
     def recording_exists(self) -> bool:
         """Whether the recording's file exists; True for a virtual recording."""
-        return self.recording.startswith(VIRTUAL) or Path(self.recording).exists()
+        return self.recording.startswith(VIRTUAL) or durable.is_there(self.recording)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
 """Open a depth recording of any format: dispatch from a path to the reader.
 
 The format follows from the name of a file, or from the names in a folder; an MCAP file, such as an
-archive by `liex pack`, is also recognised by its first bytes. A reader's module and its libraries
-are imported on demand.
+archive by `liex pack`, is also recognised by its first bytes. Several files of one camera are one
+recording. A reader's module and its libraries are imported on demand.
 """
 
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,6 +15,7 @@ from liex_lab.errors import LiexError, RecordingError
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.durable import named_files
 from liex_lab.runtime.progress import Progress, silent
 
 _READS = (
@@ -29,6 +31,7 @@ _ALONE = {  # suffix of a file that is a whole recording: module and function of
     ".oni": ("oni", "open_oni"),
     **dict.fromkeys((".bag", ".db3"), ("messages.rosbag", "open_bag")),
 }
+_ROLLED = (".mcap", ".oni", ".bag", ".db3")  # of recorders that begin a new file now and then
 _FILES = _ALONE | {".dat": _MOSEQ} | dict.fromkeys(_IMAGES, ("images.folder", "open_images"))
 _MCAP = b"\x89MCAP0\r\n"
 _PACKED = "is packed, and only .tar.gz is read as it is; unpack it{} and give the result"
@@ -79,7 +82,8 @@ def open_recording(
 
     Args:
         path: a file or a folder, or 'synthetic:walk?seed=3&frames=300' for a virtual animal (see
-            `open_synthetic`).
+            `open_synthetic`). A pattern such as cam1_*.mcap, or a folder of files that continue
+            each other, is one recording in several files (see `join_parts`).
         camera: overrides the camera in the files; a `Lens` fits images of any size.
         fps: frame rate, Hz; used only if the files contain no time stamps.
         topic: the depth topic to read from an MCAP file or a ROS bag with several of them.
@@ -102,7 +106,17 @@ def open_recording(
             simulator = import_module("liex_lab.simulation.simulator")
             recording = simulator.open_synthetic(str(path), camera)
         else:
-            (module, name), file = _reader_of(path)
+            files = _files_of(path)
+            if len(files) > 1:
+                from liex_lab.recordings.parts import join_parts
+
+                settings: dict[str, Any] = {"camera": camera, "fps": fps, "topic": topic}
+                settings |= {"pattern": pattern, "strict": strict}
+                opener = partial(open_recording, **settings)
+                return join_parts(
+                    files, opener, unbroken=files[0].parent == path, progress=progress
+                )
+            (module, name), file = _reader_of(files[0])
             reader = import_module(f"liex_lab.recordings.formats.{module}")
             more: dict[str, dict[str, Any]] = {
                 "open_images": {"pattern": pattern},
@@ -159,6 +173,23 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
     except (LiexError, OSError):
         return ""
     return str(facts.get("subject_id", ""))
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The files or folders that are one recording: of a pattern, or of a folder of files alike.
+
+    Raises:
+        RecordingError: nothing matches the pattern.
+    """
+    found = named_files(path)
+    if not found:
+        raise RecordingError(f"no file or folder matches {path}; check the spelling")
+    if len(found) == 1 and found[0].is_dir():
+        inside = sorted(one for one in found[0].iterdir() if not one.name.startswith("."))
+        kinds = {one.suffix.lower() for one in inside} & set(_FILES)
+        alike = [one for one in inside if one.suffix.lower() in _ROLLED]
+        return alike if len(alike) > 1 and len(kinds) == 1 else found
+    return found
 
 
 def _reader_of(path: Path) -> tuple[tuple[str, str], Path]:

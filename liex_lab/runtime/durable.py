@@ -11,6 +11,7 @@ removed only when the rename is on disk.
 """
 
 import errno
+import glob
 import hashlib
 import os
 import shutil
@@ -177,6 +178,32 @@ def named_beside(text: str) -> bool:
     parts = PurePosixPath(text.replace("\\", "/")).parts
     outside = text.startswith(("/", "\\", "~")) or text[1:2] == ":" or ".." in parts
     return not outside and "\0" not in text
+
+
+def named_files(text: str | Path) -> list[Path]:
+    """The files and folders that a path or a pattern names.
+
+    A pattern contains * or ?, or lists names in braces, as in day1/{a.mcap,b.mcap}.
+
+    Args:
+        text: a path or a pattern.
+
+    Returns:
+        What matches, in order of name; what is listed in braces, whether or not it exists; or the
+        path itself.
+    """
+    path = Path(text)
+    if path.name.startswith("{") and path.name.endswith("}"):
+        return [path.parent / name for name in path.name[1:-1].split(",")]
+    if path.exists() or not {"*", "?"} & set(str(path)):
+        return [path]
+    return sorted(map(Path, glob.glob(str(path).replace("[", "[[]"))))
+
+
+def is_there(text: str | Path) -> bool:
+    """Whether everything that a path or a pattern names exists, see `named_files`."""
+    found = named_files(text)
+    return bool(found) and all(path.exists() for path in found)
 
 
 # Detecting full disks.

@@ -28,6 +28,7 @@ from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import MAX_BLOBS
 from liex_lab.scene.background import (
     FloorLevel,
+    RaisedGround,
     SceneChange,
 )
 from liex_lab.scene.floor import Array, Depths, Floor, Mask
@@ -82,7 +83,7 @@ class BackgroundSubtraction(Segmenter):
     support_plane: SupportPlane | None = None
     level: FloorLevel | None = None
     worn: tuple[Worn, ...] = ()
-    changed: SceneChange | None = None
+    changed: SceneChange | RaisedGround | None = None
     sensor: SensorCard | None = None
     transient_objects: tuple[Fixture, ...] = ()
     n_animals: int = 1
@@ -229,7 +230,7 @@ class BackgroundSubtraction(Segmenter):
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Whether the camera was displaced or the scene rearranged during the recording."""
+        """Whether the camera was displaced, or the scene or its ground changed."""
         return () if self.changed is None else (self.changed.sentence,)
 
     def cleared(self, depths: Depths) -> Depths:

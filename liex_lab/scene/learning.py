@@ -30,6 +30,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import (
     BareGround,
     FloorLevel,
+    RaisedGround,
     SceneChange,
     sample_frames,
     sampled,
@@ -459,7 +460,11 @@ def learn_scene(
     scene = replace(scene, n_animals=n_animals, n_animals_share=share)
     scene = replace(scene, sensor=read_sensor(scene, sample))
     if target.stands_on_floor and changed is None:
-        scene = replace(scene, transient_objects=find_transient_objects(scene, sample, times_s))
+        objects = find_transient_objects(scene, sample, times_s)
+        # an animal asleep, or several side by side, are no ground
+        least = (target.min_height_mm, 1.5 * max(n_animals, 1) * scene.area_mm2)
+        raised = None if objects else RaisedGround.find(sample, scene.on_floor, scene.grid, least)
+        scene = replace(scene, transient_objects=objects, changed=raised)
     return scene, sample
 
 

@@ -55,6 +55,8 @@ FILES = {  # of a session, and whether every version writes it
     "summary.csv": False,
     "transitions.parquet": False,
     "activity.parquet": False,
+    "hours.parquet": False,
+    "rhythm.parquet": False,
     "zones.parquet": False,
     "interactions.parquet": False,
     "interaction_totals.parquet": False,
@@ -226,6 +228,13 @@ class Session:
         "activity",
         "Table `activity`, one row per time bin: distance (mm) and share of each action.",
     )
+
+    hours = _table(
+        "hours",
+        "Table `hours`, one row per hour of the clock: light, distance (mm), sleep by immobility.",
+    )
+
+    rhythm = _table("rhythm", "Table `rhythm`, one row: light and dark, and circadian measures.")
 
     interactions = _table(
         "interactions",

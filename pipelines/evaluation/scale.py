@@ -482,7 +482,7 @@ def repeat_session(session: Session, folder: Path, seconds: float) -> tuple[int,
     )
     folder.mkdir()
     results.write_track(folder)
-    results.write_measured(folder, behaviour.tables, behaviour.vocabulary.columns)
+    results.write_measured(folder, behaviour.tables, behaviour.columns)
     for name in ("plan.toml", "session.rrd", "session.mcap"):
         shutil.copyfile(session.path / name, folder / name)
     if (session.path / "thumbnails").is_dir():

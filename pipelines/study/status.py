@@ -118,18 +118,19 @@ def input_stamp(recording: str) -> str:
     """
     if recording.startswith(VIRTUAL):
         return recording
-    path = Path(recording)
-    if not path.exists():
+    if not durable.is_there(recording):
         return ""
-    whole = path.is_dir()
-    folder = path if whole else path.parent
     notes = {".toml", ".txt", ".csv", ".json", ".yaml", ".yml"}  # metadata next to a recording
     entries = []
-    for file in folder.rglob("*") if whole else folder.iterdir():
-        if (whole or file == path or file.suffix.lower() in notes) and not file.is_dir():
-            with suppress(OSError):  # it has just been removed
-                found = file.stat()
-                entries.append([str(file.relative_to(folder)), found.st_size, found.st_mtime_ns])
+    for path in durable.named_files(recording):
+        whole = path.is_dir()
+        folder = path if whole else path.parent
+        for file in folder.rglob("*") if whole else folder.iterdir():
+            if (whole or file == path or file.suffix.lower() in notes) and not file.is_dir():
+                with suppress(OSError):  # it has just been removed
+                    found = file.stat()
+                    name = str(file.relative_to(folder))
+                    entries.append([name, found.st_size, found.st_mtime_ns])
     return hashlib.sha256(json.dumps(sorted(entries)).encode()).hexdigest()[:32]
 
 

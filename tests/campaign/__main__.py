@@ -28,7 +28,7 @@ SIZES = {
     "workers": 20,
     "slurm": 20,
 }
-OTHERS = ("faults", "broken", "fuzz")
+OTHERS = ("faults", "broken", "fuzz", "day")
 
 
 def main() -> None:
@@ -40,9 +40,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="of a recording")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path, help="where the figures are kept")
-    parser.add_argument("--minutes", type=float, default=60.0, help="fuzz: of one core's work")
+    parser.add_argument("--minutes", type=float, default=60.0, help="of one core (fuzz), or a day")
     parser.add_argument(
-        "--folder", type=Path, help="of the hundred sessions: given again, it goes on there"
+        "--folder",
+        type=Path,
+        help="of the hundred sessions, or the day: given again, it goes on there",
     )
     asked = parser.parse_args()
     parts = list(SIZES) if asked.part == "all" else [asked.part]
@@ -90,12 +92,13 @@ def _counted(part: str, asked: argparse.Namespace) -> Tally:
 
 def _other(asked: argparse.Namespace) -> dict[str, Any]:
     """A campaign with figures of its own."""
-    from tests.campaign import faults, fuzz, studies
+    from tests.campaign import day, faults, fuzz, studies
 
     others: dict[str, Callable[[], dict[str, Any]]] = {
         "faults": lambda: faults.faults(asked.n or 3, asked.frames or 300, asked.seed),
         "broken": lambda: studies.broken(asked.n or 100, asked.frames or 30, 2, asked.folder),
         "fuzz": lambda: fuzz.fuzz(asked.minutes, asked.seed),
+        "day": lambda: day.day(asked.folder or Path("day"), asked.minutes, 120.0, asked.seed),
     }
     return others[asked.part]()
 

@@ -22,7 +22,12 @@ from liex_lab.runtime.processes import Processes
 from liex_lab.sessions import Session
 from liex_lab.sessions.evidence import linked_recording
 from tests.pipelines.conftest import KEPT, TIMES_NS, measure
-from tests.recordings.writers import write_archive, write_camera, write_moseq_folder
+from tests.recordings.writers import (
+    write_archive,
+    write_camera,
+    write_mcap_parts,
+    write_moseq_folder,
+)
 from tests.sessions.test_checkpoint import depth_messages, tables_of
 
 LENGTH = 8  # frames of a shard here
@@ -81,6 +86,28 @@ def test_complete_shards_are_kept_after_an_error(
     assert tables_of(done) == tables_of(walked.path)
     assert depth_messages(done) == depth_messages(walked.path)
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_recording_in_parts_gives_the_tables_of_the_whole(
+    images: np.ndarray, mouse: Any, tmp_path: Path
+) -> None:
+    whole, split = (tmp_path / name for name in ("whole", "split"))
+    for folder, cuts in ((whole, ()), (split, (9, 22))):
+        folder.mkdir()
+        write_mcap_parts(folder, images, cuts, TIMES_NS, mouse.camera)
+    light = ["light.on=07:00", "light.off=19:00", "light.zone=Europe/Berlin"]
+    plan = Plan.load("mouse").with_settings(light)
+    single = (whole / "cam1_0.mcap").rename(whole / "cam1.mcap")
+    at_once = measure(single, plan, tmp_path / "once")
+    parts, out = split / "cam1_*.mcap", tmp_path / "parts"
+    with pytest.raises(SessionError, match="without a word"):
+        measure(parts, plan, out, pool=InTurn(accident_after=2))
+    again = measure(parts, plan, out)
+    assert list(Session.open(again).hours["clock"]) == ["2025-10-09T10:53:20+02:00"]
+    assert tables_of(again) == tables_of(at_once)
+    assert depth_messages(again) == depth_messages(at_once)
+    assert linked_recording(Session.open(again)) == str(parts)
+    assert not [one.sentence for one in verify_session(again) if one.state == "wrong"]
 
 
 @pytest.mark.nightly

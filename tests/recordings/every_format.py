@@ -41,6 +41,7 @@ from tests.recordings.writers import (
     write_archive,
     write_camera,
     write_mcap,
+    write_mcap_parts,
     write_moseq_folder,
     write_oni_file,
     write_png_folder,
@@ -276,6 +277,7 @@ FORMATS = (
         lambda f, s: write_mcap(f / "recording.mcap", s),
         before(_mcap_ends, ".mcap"),
     ),
+    Format("mcap-parts", write_mcap_parts, lambda path, at: None),
     Format(
         "mcap-unchunked",
         lambda f, s: write_mcap(f / "recording.mcap", s, use_chunks=False),

@@ -3,6 +3,7 @@ open.
 """
 
 import io
+import itertools
 import json
 import math
 import struct
@@ -201,6 +202,22 @@ def write_mcap(
             )
     writer.close()
     return path
+
+
+def write_mcap_parts(
+    folder: Path,
+    frames: Frames,
+    cuts: Sequence[int] = (2, 5),
+    times_ns: Sequence[int] | None = None,
+    camera: Camera | None = SMALL,
+) -> Path:
+    """The frames in MCAP files cam1_0.mcap, cam1_1.mcap ... that begin at `cuts`; the folder."""
+    times = even_times(len(frames)) if times_ns is None else times_ns
+    edges = [0, *cuts, len(frames)]
+    for k, (start, stop) in enumerate(itertools.pairwise(edges)):
+        path = folder / f"cam1_{k}.mcap"
+        write_mcap(path, frames[start:stop], camera, times_ns=times[start:stop])
+    return folder
 
 
 def _image(

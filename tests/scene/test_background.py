@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from liex_lab.optics.camera import Camera
-from liex_lab.scene.background import FloorLevel, SceneChange, wandering
+from liex_lab.scene.background import FloorLevel, RaisedGround, SceneChange, wandering
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.learning import learn_scene
 from tests.scene.staged import altered, walked
@@ -111,3 +111,33 @@ def test_a_camera_that_is_pushed_aside_is_told_and_so_is_one_that_slides() -> No
 def test_an_animal_that_sleeps_here_and_there_changes_nothing() -> None:
     sleeps = seen(slice(70, 110), slice(200, 240), slice(130, 170), slice(70, 110))
     assert SceneChange.find(sleeps, TIMES, CAMERA, 5400.0) is None
+
+
+# A nest that is built, or bedding that is dug away, is told; animals that sleep are not.
+
+
+ROWS, COLUMNS = np.mgrid[:240, :320]
+NEST = np.clip(1.3 - np.hypot(ROWS - 70, COLUMNS - 210) / 22.0, 0.0, 1.0)  # 100 mm across
+
+
+@pytest.mark.parametrize("height_mm", [15.0, -15.0])
+def test_a_nest_that_is_built_and_bedding_that_is_dug_away_are_told(height_mm: float) -> None:
+    def built(k: int, depth: np.ndarray) -> np.ndarray:
+        bare = walked()[0].floor.depth(320, 240)
+        ground = np.abs(depth - bare) < 6.0
+        return depth - ground * (NEST * height_mm * k / (N_CHANGED - 1)).astype(np.float32)
+
+    scene = learned_from(built)
+    assert isinstance(scene.changed, RaisedGround)
+    assert scene.changed.rise_mm == pytest.approx(0.65 * height_mm, abs=2.5)  # from third to third
+    assert 30e2 < scene.changed.area_mm2 < 100e2
+    assert f"such as a nest or bedding, {'rose' if height_mm > 0 else 'sank'} by" in scene.doubts[0]
+
+
+def test_animals_that_sleep_are_no_ground_that_rises() -> None:
+    sleeps = seen(slice(70, 110), slice(200, 240), slice(130, 170))
+    on_floor = empty() == 700.0
+    assert RaisedGround.find(sleeps, on_floor, CAMERA, (7.0, 1.5 * 5400.0)) is None
+    risen = sleeps - np.linspace(0.0, 15.0, N_CHANGED)[:, None, None].astype(np.float32)
+    assert RaisedGround.find(risen, on_floor, CAMERA, (7.0, 1.5 * 5400.0)) is not None
+    assert RaisedGround.find(risen[:20], on_floor, CAMERA, (7.0, 8100.0)) is None
