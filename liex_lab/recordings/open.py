@@ -21,7 +21,8 @@ from liex_lab.runtime.progress import Progress, silent
 _READS = (
     "a folder of 16-bit PNG, TIFF, PGM or PCLZF images with a camera.toml, exports of a Raytrix "
     "camera with a raytrix.toml, a MoSeq session (its folder, depth.dat, depth.avi, depth.mkv or "
-    ".tar.gz), a PrimeSense recording (.oni), an MCAP file or a ROS bag (.bag, .db3)"
+    ".tar.gz) or its extraction (results_00.h5), a PrimeSense recording (.oni), an MCAP file or a "
+    "ROS bag (.bag, .db3)"
 )
 _IMAGES = (".png", ".tif", ".tiff", ".pgm", ".pclzf")
 _MOSEQ = ("moseq", "open_moseq")
@@ -29,6 +30,7 @@ _ALONE = {  # suffix of a file that is a whole recording: module and function of
     **dict.fromkeys((".tar.gz", ".tgz", ".tar", ".avi", ".mkv"), _MOSEQ),
     ".mcap": ("messages.mcap", "open_mcap"),
     ".oni": ("oni", "open_oni"),
+    ".h5": ("moseq_results", "open_results"),
     **dict.fromkeys((".bag", ".db3"), ("messages.rosbag", "open_bag")),
 }
 _ROLLED = (".mcap", ".oni", ".bag", ".db3")  # of recorders that begin a new file now and then
@@ -57,7 +59,7 @@ _NOT_READ = {
         "the depth itself",
     ),
     **dict.fromkeys(
-        (".h5", ".npy", ".npz", ".rrd", ".xef", ".svo", ".svo2"),
+        (".npy", ".npz", ".rrd", ".xef", ".svo", ".svo2"),
         "is in a format that is not read yet; export it as 16-bit PNG images, one to a frame",
     ),
     **dict.fromkeys(
@@ -160,7 +162,7 @@ def stated_subject(path: Path, progress: Progress = silent) -> str:
     name = path.name.lower()
     notes = {file: folder / file for file in (METADATA, CAMERA_FILE)}
     try:
-        if name.endswith(".mcap"):
+        if name.endswith((".mcap", ".h5")):
             with open_recording(path, strict=True) as recording:
                 return str(recording.metadata.get("subject_id", ""))
         with TemporaryDirectory() as scratch:

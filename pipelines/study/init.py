@@ -29,6 +29,7 @@ from liex_lab.runtime.durable import write_whole
 from liex_lab.runtime.progress import Progress, silent
 
 _DEPTHS = ("depth.dat", "depth.avi", "depth.mkv")  # each marks its folder as a recording
+_EXTRACTION = re.compile(r"results_\d\d\.h5$")  # of MoSeq
 _COMPARED_BYTES = 1 << 20  # compared at the beginning and the end of files of the same size
 _MOST_LISTED = 4  # sessions of an animal
 Named = tuple[str, str, Path, str]  # animal, session, recording, origin of the animal's name
@@ -165,9 +166,10 @@ def _content(path: Path) -> tuple[object, ...]:
 def find_recordings(folder: Path) -> list[Path]:
     """Every recording below a folder, in order of name, without results and hidden files.
 
-    Folders that are recordings are not searched.
+    Folders that are recordings are not searched. Extractions by MoSeq count only if there is no
+    recording, since most lie beside the one that they were made of.
     """
-    found = []
+    found, extractions = [], []
     for inside, folders, names in os.walk(folder):
         here = Path(inside)
         files = [
@@ -181,6 +183,7 @@ def find_recordings(folder: Path) -> list[Path]:
         noted = not set(names).isdisjoint(("camera.toml", "raytrix.toml")) and not files
         one_recording = here != folder and (noted or not set(names).isdisjoint(_DEPTHS))
         found += [here] if one_recording else [here / name for name in files if name[0] != "."]
+        extractions += [here / name for name in sorted(names) if _EXTRACTION.search(name)]
         folders[:] = sorted(
             name
             for name in folders
@@ -190,7 +193,7 @@ def find_recordings(folder: Path) -> list[Path]:
             and not name.endswith((".liex", ".part"))
             and not (here / name / "session.json").exists()
         )
-    return found
+    return found or extractions
 
 
 def name_sessions(stated: Mapping[Path, str], raw: Path) -> tuple[list[Named], list[str]]:

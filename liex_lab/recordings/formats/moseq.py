@@ -364,6 +364,18 @@ def read_metadata(path: Path | None, cut: bool) -> Metadata:
         raise RecordingError(
             f"{METADATA} of the session is not JSON ({error}); correct or remove it"
         ) from None
+    return stated_in(document)
+
+
+def stated_in(document: dict[str, Any]) -> Metadata:
+    """What the metadata of a session state.
+
+    Args:
+        document: the content of metadata.json, or its copy in a file of results.
+
+    Raises:
+        RecordingError: DepthResolution is invalid.
+    """
     stated = document.get("StartTime")
     facts = {
         key: str(value).strip()
@@ -516,9 +528,44 @@ def azure_camera(size: Size, lens: FactoryLens | None) -> Camera:
     )
 
 
+def assumed_camera(
+    path: Path, size: Size, kind: str, metadata: Metadata, problems: list[str]
+) -> Camera:
+    """The typical camera of a recording without intrinsics.
+
+    Args:
+        path: the recording, for the error message.
+        size: columns and rows of the images, px.
+        kind: of the camera, see `Metadata`; no camera but a Kinect v2 has the size of its images.
+        metadata: may name the camera.
+        problems: sentences, appended to.
+
+    Raises:
+        RecordingError: no known camera of that kind has such images.
+    """
+    if kind == KINECT and size == _KINECT_V2_SIZE:
+        typical, name = KINECT_V2, "Kinect v2"
+    elif kind == AZURE and size in MODES:
+        typical = azure_camera(size, None)
+        name = f"Azure Kinect in the mode {MODES[size][0]}"
+    else:
+        whose = f"the camera {metadata.camera_name!r}"
+        raise RecordingError(
+            f"{path} holds images of {size[0]} x {size[1]} pixels from "
+            f"{whose if metadata.camera_name else 'a camera that is not known'}; write a "
+            "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
+            "pixels"
+        )
+    problems.append(
+        f"the files hold no intrinsics, so those of a typical {name} were taken; state your "
+        "camera's own in a camera.toml beside the recording"
+    )
+    return typical
+
+
 DEPTH = "depth.dat"
 DEPTHS = (DEPTH, "depth.avi", "depth.mkv")
-_NOMINAL_HZ = 30.0  # rate of every camera that MoSeq supports
+NOMINAL_HZ = 30.0  # rate of every camera that MoSeq supports
 _KINECT_V2_SIZE = (512, 424)
 _OTHER_SIZES = (
     (640, 480),
@@ -759,28 +806,10 @@ class _Session:
         lens = next(filter(None, map(read_calibration, attached)), None)
         if (width, height) in MODES and lens is not None:
             return azure_camera((width, height), lens)
-        # no other camera has a Kinect v2's size
         kind = self.metadata.camera or KINECT
         if video is not None and any(name.startswith("K4A_") for name in video.tags):
             kind = AZURE
-        if kind == KINECT and (width, height) == _KINECT_V2_SIZE:
-            typical, name = KINECT_V2, "Kinect v2"
-        elif kind == AZURE and (width, height) in MODES:
-            typical = azure_camera((width, height), None)
-            name = f"Azure Kinect in the mode {MODES[width, height][0]}"
-        else:
-            whose = f"the camera {self.metadata.camera_name!r}"
-            raise RecordingError(
-                f"{self.path} holds images of {width} x {height} pixels from "
-                f"{whose if self.metadata.camera_name else 'a camera that is not known'}; write a "
-                "camera.toml beside it with [camera], fx = ..., fy = ..., cx = ... and cy = ... in "
-                "pixels"
-            )
-        self.problems.append(
-            f"the files hold no intrinsics, so those of a typical {name} were taken; state your "
-            "camera's own in a camera.toml beside the recording"
-        )
-        return typical
+        return assumed_camera(self.path, (width, height), kind, self.metadata, self.problems)
 
     def _times(self, stack: Stack, own: DepthVideo | None) -> Times:
         """The stamps next to the depth, or else its own, or else a constant rate."""
@@ -790,7 +819,7 @@ class _Session:
         if self.stamps is not None and (own is None or own.even or not counted):
             name = self.stamps.path.name
             known = None if own is None else 1e9 / max(median_step(own.times_ns), 1)
-            stamps = self.stamps.times(hz or known, self.problems, self.doubts, _NOMINAL_HZ)
+            stamps = self.stamps.times(hz or known, self.problems, self.doubts, NOMINAL_HZ)
             if self.cut and 1 < len(stamps) < n:  # a frame is worth keeping without its exact time
                 step = max(1, median_step(stamps))
                 n_late = n - len(stamps)
@@ -821,7 +850,7 @@ class _Session:
             return own.times_ns
         origin = "as stated" if hz else "which is the usual rate; state fps if yours differs"
         self.problems.append(
-            f"there are no time stamps, so a constant {hz or _NOMINAL_HZ:g} frames/s was assumed, "
+            f"there are no time stamps, so a constant {hz or NOMINAL_HZ:g} frames/s was assumed, "
             f"{origin}"
         )
-        return from_rate(n, hz or _NOMINAL_HZ)
+        return from_rate(n, hz or NOMINAL_HZ)

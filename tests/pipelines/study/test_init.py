@@ -165,6 +165,13 @@ def test_sessions_of_moseq_are_of_the_animal_in_their_metadata(
     assert "named by: metadata" in (tmp_path / "study.toml").read_text()
 
 
+def test_extractions_of_moseq_are_listed_only_without_their_recordings(tmp_path: Path) -> None:
+    touch(tmp_path, "rawdata/session_1/proc/results_00.h5", "rawdata/poses.h5")
+    assert [one.parent.parent.name for one in find_recordings(tmp_path)] == ["session_1"]
+    touch(tmp_path, "rawdata/session_1.tar.gz")
+    assert [one.name for one in find_recordings(tmp_path)] == ["session_1.tar.gz"]
+
+
 @pytest.mark.parametrize(
     "names",
     [
