@@ -133,6 +133,24 @@ def _leaves(name: str, command: Any, depth: int = 0) -> Iterator[tuple[str, Any,
                 yield from _leaves(f"{name} {inner}", found, depth + 1)
 
 
+def cameras() -> str:
+    """Every depth mode of the cameras by name, with the source of its figures."""
+    from liex_lab.optics.camera import DEPTH_MODES
+
+    lines = [
+        "| name | mode | image, px | focal length, px | range, m | frames/s | unit, mm | source |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, mode, camera, reach, rates, unit in DEPTH_MODES:
+        far = "" if reach is None else f"{reach[0] / 1e3:g} to {reach[1] / 1e3:g}"
+        hertz = ", ".join(map(str, rates))
+        lines.append(
+            f"| `{name}` | {mode} | {camera.width} x {camera.height} | {camera.fx:g} | {far} | "
+            f"{hertz} | {unit:g} | {camera.source} |"
+        )
+    return "\n".join(lines)
+
+
 def command_line() -> str:
     """Every verb of `liex` with its usage and options."""
     from liex_lab.cli.main import app
@@ -327,6 +345,7 @@ def _docstring(one: Any) -> list[str]:
 
 PARTS: dict[str, Callable[[], str]] = {
     "command-line": command_line,
+    "cameras": cameras,
     "every-column": every_column,
     "first-columns": first_columns,
     "settings": settings,

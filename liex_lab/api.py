@@ -66,6 +66,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "evaluate_report": "evaluation.scale",
     "evaluate_statistics": "evaluation.statistics",
     "evaluate_sync": "evaluation.sync",
+    "evaluate_cameras": "evaluation.cameras",
     "evaluate_motion": "evaluation.motion",
     "motion_in_short": "evaluation.motion",
     "evaluate_nyu": "evaluation.nyu",

@@ -412,6 +412,39 @@ def evaluate_actions(
     )
 
 
+@benchmark("cameras", lambda result: print_rows(result["rows"]))
+def evaluate_cameras(
+    cameras: Annotated[
+        str | None,
+        typer.Option("--only", metavar="NAME,...", help="Measure only these cameras."),
+    ] = None,
+    distances: Annotated[
+        str, typer.Option("--mm", metavar="MM,...", help="Heights above the floor, mm.")
+    ] = "500,750,1000",
+    n_frames: Annotated[
+        int, typer.Option("--frames", min=20, help="Number of frames of each recording.")
+    ] = 120,
+    n_recordings: Annotated[
+        int, typer.Option("--recordings", min=1, help="Recordings per camera and distance.")
+    ] = 4,
+    *,
+    progress: Progress,
+) -> Result:
+    """Measure joint errors of a mouse by camera and distance, in simulation."""
+    named = {} if cameras is None else {"cameras": cameras.split(",")}
+    try:
+        mm = [float(one) for one in distances.split(",")]
+    except ValueError:
+        raise LiexError(f"--mm takes numbers such as 500,750, got '{distances}'") from None
+    return api.evaluate_cameras(
+        **named,
+        distances_mm=mm,
+        n_frames=n_frames,
+        n_recordings=n_recordings,
+        progress=progress,
+    )
+
+
 @benchmark("tracking")
 def evaluate_tracking(
     animal: AnimalName = "mouse",

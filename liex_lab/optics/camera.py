@@ -10,10 +10,12 @@ x^2 + y^2, in OpenCV's convention:
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -344,28 +346,60 @@ RAYTRIX_R5_WIDE = Camera(1800.0, 1800.0, 511.5, 511.5, 1024, 1024, source="R5, s
 RAYTRIX_R5_LONG = Camera(2900.0, 2900.0, 639.5, 639.5, 1280, 1280, source="R5, longer lens")
 
 
-# Depth cameras by name, for recordings that do not state their camera.
+# Depth cameras by name: nominal figures of every depth mode, with their source, from cameras.csv.
 
 
-_AZURE = Distortion(
-    BROWN_CONRADY, (4.72474, 3.20922, 5.9e-6, 0.000124, 0.170596, 5.05586, 4.77578, 0.886494)
-)
-_FEMTO = Distortion(
-    BROWN_CONRADY, (8.68957, 4.46817, 0.0, 0.0, 0.172922, 9.01699, 7.37854, 1.05598)
-)
+_LENSES = {
+    "": None,
+    "azure": Distortion(
+        BROWN_CONRADY, (4.72474, 3.20922, 5.9e-6, 0.000124, 0.170596, 5.05586, 4.77578, 0.886494)
+    ),
+    "femto": Distortion(
+        BROWN_CONRADY, (8.68957, 4.46817, 0.0, 0.0, 0.172922, 9.01699, 7.37854, 1.05598)
+    ),
+}
+
+
+class DepthMode(NamedTuple):
+    """A depth mode of a camera by name, as its maker states it.
+
+    Attributes:
+        name: of the camera, a key of `PRESETS`.
+        mode: of its depth stream.
+        camera: nominal intrinsics; a specimen differs by one or two per cent.
+        range_mm: nearest and farthest distance, mm; None if not stated.
+        rates_hz: its frame rates, frames/s.
+        unit_mm: mm of a step of its depth, as delivered.
+    """
+
+    name: str
+    mode: str
+    camera: Camera
+    range_mm: tuple[float, float] | None
+    rates_hz: tuple[int, ...]
+    unit_mm: float
+
+
+def _depth_modes() -> tuple[DepthMode, ...]:
+    text = Path(__file__).with_name("cameras.csv").read_text(encoding="utf-8")
+    modes = []
+    for row in csv.DictReader(text.splitlines()):
+        fx, fy, cx, cy = (float(row[key]) for key in ("fx", "fy", "cx", "cy"))
+        size = int(row["width"]), int(row["height"])
+        camera = Camera(fx, fy, cx, cy, *size, row["source"], distortion=_LENSES[row["lens"]])
+        reach = (float(row["near_mm"]), float(row["far_mm"])) if row["far_mm"] else None
+        rates = tuple(map(int, row["rates_hz"].split()))
+        modes.append(
+            DepthMode(row["name"], row["mode"], camera, reach, rates, float(row["unit_mm"]))
+        )
+    return tuple(modes)
+
+
+DEPTH_MODES = _depth_modes()
 # for each name, one camera per image size
 PRESETS = {
-    "kinect-v2": (KINECT_V2,),
-    "primesense": (PRIMESENSE, PRIMESENSE_QVGA),
-    "azure-nfov": (Camera(503.9, 503.7, 321.0, 328.5, 640, 576, distortion=_AZURE),),
-    "femto-bolt": (Camera(505.3, 505.2, 338.2, 325.0, 640, 576, distortion=_FEMTO),),
-    "d435": (
-        Camera(424.2, 424.2, 423.4, 239.5, 848, 480),
-        Camera(384.2, 384.2, 319.5, 239.5, 640, 480),
-        Camera(638.0, 638.0, 639.5, 359.5, 1280, 720),
-        Camera(320.2, 320.2, 319.6, 179.5, 640, 360),
-    ),
-    "raytrix-r5": (RAYTRIX_R5,),
+    name: tuple(one.camera for one in DEPTH_MODES if one.name == name)
+    for name in dict.fromkeys(one.name for one in DEPTH_MODES)
 }
 
 
@@ -388,16 +422,7 @@ def preset(name: str, width: int, height: int) -> Camera:
     cameras = PRESETS[name]
     for camera in cameras:
         if (camera.width, camera.height) == (width, height):
-            return Camera(
-                camera.fx,
-                camera.fy,
-                camera.cx,
-                camera.cy,
-                width,
-                height,
-                source=f"preset {name}",
-                distortion=camera.distortion,
-            )
+            return replace(camera, source=f"preset {name}")
     sizes = " or ".join(f"{camera.width} x {camera.height}" for camera in cameras)
     raise LiexError(
         f"the camera '{name}' has images of {sizes} px, but these have {width} x {height}; "
@@ -431,7 +456,7 @@ def unusual_lens(camera: Camera) -> str:
         for name, cameras in PRESETS.items()
         for one in cameras
         if (one.width, one.height) == size
-        and size in ((640, 480), (512, 424), (320, 240), (640, 576))
+        and size in ((640, 480), (512, 424), (320, 240), (640, 576), (320, 288), (512, 512))
     }
     # specimens, and images mapped to another lens, differ by less
     if not usual_px or any(abs(camera.fx / fx - 1.0) <= 0.1 for fx in usual_px.values()):

@@ -23,7 +23,20 @@ ClockTime = Annotated[str, Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d$")]
 ArenaName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 # names of liex_lab.optics.camera, repeated here because a plan is read before libraries are
 # imported
-CameraName = Literal["kinect-v2", "primesense", "azure-nfov", "femto-bolt", "d435", "raytrix-r5"]
+CameraName = Literal[
+    "kinect-v2",
+    "primesense",
+    "azure-nfov",
+    "azure-wfov",
+    "femto-bolt",
+    "femto-mega",
+    "gemini-2",
+    "gemini-335",
+    "d435",
+    "d455",
+    "d405",
+    "raytrix-r5",
+]
 N_PLACES = 5  # along the body, of liex_lab.estimation.session_shape
 _TAXON = "http://purl.obolibrary.org/obo/NCBITaxon_"
 _LATIN = re.compile(rf"[A-Z][a-z]+ [a-z]+|{re.escape(_TAXON)}\d+")

@@ -1,9 +1,11 @@
-"""Noise models of depth sensors: structured light, time of flight, plenoptic (light field).
+"""Noise models of depth sensors: structured light, stereo, time of flight, plenoptic (light field).
 
-PrimeSense: disparity f b / z, quantised to eighths of a pixel, with projector shadow. Kinect v2:
-axial noise that grows as z^2 with radial and slope terms, and flying pixels at edges. Light field:
-smooth range noise growing as z^2, texture-less gaps and mismatches. Before any of them, `soften`
-blurs the outline of fur; `sense` selects the model.
+PrimeSense: disparity f b / z, quantised to eighths of a pixel, with projector shadow; stereo is the
+same with another baseline and step, the second camera in the place of the projector, so that the
+error of depth is z^2 / (f b) times that of disparity. Kinect v2 and Azure: axial noise that grows
+as z^2 with radial and slope terms, and flying pixels at edges. Light field: smooth range noise
+growing as z^2, texture-less gaps and mismatches. Before any of them, `soften` blurs the outline of
+fur and `smear` the edges of what moves; `sense` selects the model.
 
 All random numbers come from a xorshift64 generator (Marsaglia 2003) whose state (1,) uint64 belongs
 to one image, so an image depends on its seed alone, never on threads or order.
@@ -20,9 +22,10 @@ import numpy as np
 from liex_lab.runtime.kernels import inner_kernel, kernel
 
 NOTHING, STILL, ANIMAL, OBJECT = range(4)  # kinds of pixels
-PRIMESENSE_KIND, KINECT_V2_KIND, LIGHT_FIELD_KIND = range(3)
+PRIMESENSE_KIND, KINECT_V2_KIND, LIGHT_FIELD_KIND, STEREO_KIND = range(4)
 BASELINE_MM = 75.0  # between the projector and the camera of a PrimeSense
 SUBPIXEL = 8.0  # its disparity is quantised to eighths of a pixel
+_LOST = 0.5  # share of the pixels that an edge sweeps during an exposure that are unread
 
 # columns of a row of sensor parameters
 (
@@ -44,8 +47,13 @@ SUBPIXEL = 8.0  # its disparity is quantised to eighths of a pixel
     UNIT,  # step of the depth image, mm
     BACKGROUND,  # error of a learned background
     OUTLIERS,  # rarity of outliers
-) = range(18)
-N_PARAMETERS = 18
+    BASELINE,  # of two views, mm
+    STEPS,  # of disparity in a pixel
+    WEAK,  # additional noise where the animal returns little light, over the usual
+    MOTION_U,  # what the animal moves during an exposure, px
+    MOTION_V,
+) = range(23)
+N_PARAMETERS = 23
 # distance from a light field's main lens to which its parameters refer; range noise grows with z^2
 TYPICAL_MM = 250.0
 
@@ -173,6 +181,43 @@ def soften(depth, what, p, state, table, field):
             what[lost[i, 0], lost[i, 1]] = STILL
 
 
+@inner_kernel()
+def smear(depth, what, p, state):
+    """Unread and mixed depth where the animal's edges pass during one exposure.
+
+    A pixel that shows the animal for a part of the exposure and something else for the rest is
+    unread (`_LOST`), or mixes both depths.
+
+    Args:
+        depth: (H, W) float32 mm, changed in place.
+        what: (H, W) uint8 kinds.
+        p: (N_PARAMETERS,) of the sensor.
+        state: (1,) uint64 of the generator, advanced.
+    """
+    height, width = depth.shape
+    n = int(np.ceil(max(abs(p[MOTION_U]), abs(p[MOTION_V])) / 2.0))
+    if n == 0:
+        return
+    still = depth.copy()
+    for v in range(height):
+        for u in range(width):
+            is_animal = what[v, u] == ANIMAL
+            other = np.float32(0.0)
+            for k in range(-n, n + 1):
+                row = v + int(round(0.5 * k / n * p[MOTION_V]))
+                column = u + int(round(0.5 * k / n * p[MOTION_U]))
+                if (
+                    0 <= row < height
+                    and 0 <= column < width
+                    and (what[row, column] == ANIMAL) != is_animal
+                ):
+                    other = max(other, still[row, column])
+            if other > 0.0 and still[v, u] > 0.0:
+                share = uniform(state)
+                lost = uniform(state) < _LOST
+                depth[v, u] = 0.0 if lost else still[v, u] + share * (other - still[v, u])
+
+
 @kernel()
 def _outside(depth, what, v, u):
     """The farthest of the four neighbours that are not the animal, 0 if all are."""
@@ -201,10 +246,11 @@ def _step(depth, v, u):
 
 @inner_kernel()
 def primesense(depth, what, p, focal, state, table, out):
-    """Structured light: disparity f b / z with smooth noise, quantised to eighths of a pixel.
+    """Structured light and stereo: disparity f b / z with smooth noise, quantised to `p[STEPS]`.
 
     Disparity is estimated over a window (smooth errors, outlines displaced by about a pixel);
-    points hidden from the projector next to raised objects are unread, and so are grazing surfaces.
+    points hidden from the projector, or from the second camera, next to raised objects are unread,
+    and so are grazing surfaces.
 
     Args:
         depth: (H, W) float32 mm, 0 = nothing in range.
@@ -213,7 +259,7 @@ def primesense(depth, what, p, focal, state, table, out):
         focal: px.
         state: (1,) uint64 of the generator, advanced.
         table: (2^13,) float32 normal quantiles.
-        out: (H, W) uint16 mm, output, 0 = unread.
+        out: (H, W) uint16 in steps of `p[UNIT]` mm, output, 0 = unread.
     """
     height, width = depth.shape
     field = np.empty((height, width), np.float32)
@@ -224,7 +270,8 @@ def primesense(depth, what, p, focal, state, table, out):
     smooth_field(state, table, 2.5, move_v)
     strength = p[NOISE]
     jitter = p[JITTER]
-    fb = focal * BASELINE_MM
+    fb = focal * p[BASELINE]
+    steps = p[STEPS]
     shadow = np.empty(width, np.bool_)
     for v in range(height):
         _shadow(depth[v], fb, p[SIDE], shadow)
@@ -235,14 +282,16 @@ def primesense(depth, what, p, focal, state, table, out):
             if z <= 0.0 or shadow[column]:
                 continue
             step = abs(_step(depth, row, column)) * focal / z
-            drop = p[HOLES] + (p[DARK] if what[row, column] == ANIMAL else 0.0)
+            animal = what[row, column] == ANIMAL
+            drop = p[HOLES] + (p[DARK] if animal else 0.0)
             if step > 3.0:
                 drop += p[EDGE_DROP] * min((step - 3.0) / 6.0, 1.0)
             if uniform(state) < drop * strength:
                 continue
             noise = strength * (p[SMOOTH] * field[v, u] + p[WHITE] * normal(state, table))
-            disparity = np.round((fb / z + noise) * SUBPIXEL) / SUBPIXEL
-            out[v, u] = int(fb / disparity + 0.5) if disparity > 0.5 else 0
+            noise *= 1.0 + (p[WEAK] if animal else 0.0)
+            disparity = np.round((fb / z + noise) * steps) / steps
+            out[v, u] = int(fb / disparity / p[UNIT] + 0.5) if disparity > 0.5 else 0
 
 
 @kernel()
@@ -295,7 +344,8 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
             slope = min(abs(step) * focal / z, 3.0)
             far2 = (z * 1e-3) ** 2
             corner = 1.0 + ((u - centre_u) ** 2 + (v - centre_v) ** 2) / (focal * focal)
-            drop = p[HOLES] + (p[DARK] * (1.0 + slope) if what[v, u] == ANIMAL else 0.0)
+            animal = what[v, u] == ANIMAL
+            drop = p[HOLES] + (p[DARK] * (1.0 + slope) if animal else 0.0)
             if abs(step) > 8.0:
                 drop += p[EDGE_DROP]
                 if uniform(state) < p[FLYING]:
@@ -303,6 +353,7 @@ def kinect_v2(depth, what, p, focal, centre_u, centre_v, state, table, out):
             if uniform(state) < drop * strength:
                 continue
             spread = (0.5 + 0.5 * far2) * corner * (1.0 + 0.5 * slope) * strength
+            spread *= 1.0 + (p[WEAK] if animal else 0.0)
             z += spread * (p[SMOOTH] * field[v, u] + p[WHITE] * normal(state, table))
             out[v, u] = int(z + 0.5)
 
@@ -364,7 +415,7 @@ def light_field(depth, what, p, state, table, out):
 
 @kernel()
 def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
-    """Apply `soften` and the sensor's model to one image; depth and what are overwritten.
+    """Apply `soften`, `smear` and the sensor's model to one image; depth and what are overwritten.
 
     Args:
         depth: (H, W) float32 mm, 0 = nothing in range; changed.
@@ -379,8 +430,9 @@ def sense(depth, what, p, focal, centre_u, centre_v, state, table, field, out):
         out: (H, W) uint16 in steps of `p[UNIT]` mm, output, 0 = unread.
     """
     soften(depth, what, p, state, table, field)
+    smear(depth, what, p, state)
     out[:] = 0
-    if int(p[KIND]) == PRIMESENSE_KIND:
+    if int(p[KIND]) == PRIMESENSE_KIND or int(p[KIND]) == STEREO_KIND:
         primesense(depth, what, p, focal, state, table, out)
     elif int(p[KIND]) == LIGHT_FIELD_KIND:
         light_field(depth, what, p, state, table, out)

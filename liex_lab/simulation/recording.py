@@ -24,7 +24,7 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.runtime.memory import Rows
 from liex_lab.scene.floor import Floor
 from liex_lab.simulation._render_kernels import N_GROUND
-from liex_lab.simulation._sensor_kernels import ANIMAL, UNIT
+from liex_lab.simulation._sensor_kernels import ANIMAL, MOTION_U, MOTION_V, UNIT
 from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.rendering import Solid, Views
 from liex_lab.simulation.scene import OBJECT_FACES, SimulatedScene, draw_object
@@ -196,6 +196,30 @@ class Stage(Rows):
             shifted = np.round(depths + self.offset_mm[:, None, None].astype(np.float32))
             depths = np.where(depths > 0, shifted, 0.0).astype(np.float32)
         return depths
+
+
+def in_motion(stage: Stage, exposure_ms: float) -> Stage:
+    """The stage with the motion of its fastest animal during each exposure of the sensor.
+
+    Args:
+        stage: of n frames in order of time.
+        exposure_ms: of one depth image, ms; 0 returns the stage as it is.
+    """
+    if not (exposure_ms and stage.actors and len(stage.seeds) > 1):
+        return stage
+    T_camera_arena = stage.scene.T_arena_camera.inverse()
+    at = [
+        stage.scene.camera.project(T_camera_arena @ actor.joints.mean(axis=1))
+        for actor in stage.actors
+    ]
+    moved = np.array([np.gradient(path, axis=0) for path in at])  # px per frame
+    fastest = np.argmax(np.linalg.norm(moved, axis=-1), axis=0)
+    frame_ms = float(np.median(np.diff(stage.times_ns))) * 1e-6
+    parameters = stage.parameters.copy()
+    parameters[:, [MOTION_U, MOTION_V]] = (
+        moved[fastest, np.arange(len(fastest))] * exposure_ms / frame_ms
+    )
+    return replace(stage, parameters=parameters)
 
 
 class RenderedRecording(Recording):

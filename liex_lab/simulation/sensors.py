@@ -1,12 +1,23 @@
-"""Makes of depth sensors: their cameras, and ranges from which the noise of a unit is drawn."""
+"""Makes of depth sensors: their cameras, and ranges from which the noise of a unit is drawn.
 
-from dataclasses import dataclass
+Sources of today's cameras. Time of flight: up to 2.5 m the random error of the Azure Kinect is that
+of the Kinect v2 (Kurillo et al., Sensors 2022, 22, 2469), and the Femto Bolt and Mega have its
+sensor; an exposure takes 12.8 ms (Orbbec's hardware specification). Stereo: the error of depth is
+z^2 / (f b) times that of disparity, in steps of 1/32 px (Intel, subpixel linearity of the D400
+series); the baselines are the makers'. Assumed, for want of a published figure: an error of
+disparity of 0.05 to 0.1 px, 8.5 ms of exposure of stereo cameras, steps of the Gemini like those of
+the D400, and up to three times the noise on dark fur.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.optics.camera import (
     AZURE_KINECT,
+    DEPTH_MODES,
     KINECT_V2,
     PRIMESENSE,
     PRIMESENSE_QVGA,
@@ -28,9 +39,13 @@ class Sensor:
     Attributes:
         name: of the make.
         camera: its camera.
-        kind: number of its noise model, `PRIMESENSE_KIND`, `KINECT_V2_KIND` or `LIGHT_FIELD_KIND`.
+        kind: number of its noise model, `PRIMESENSE_KIND`, `KINECT_V2_KIND`, `LIGHT_FIELD_KIND` or
+            `STEREO_KIND`.
         unit_mm: step of its depth, mm.
         stride: only every `stride`-th pixel of its large depth images is read.
+        baseline_mm: between its two views, mm.
+        steps: of disparity in a pixel.
+        exposure_ms: of one depth image, ms; 0 records everything at rest and all fur alike.
     """
 
     name: str
@@ -38,6 +53,9 @@ class Sensor:
     kind: int
     unit_mm: float = 1.0
     stride: int = 1
+    baseline_mm: float = k.BASELINE_MM
+    steps: float = k.SUBPIXEL
+    exposure_ms: float = 0.0
 
     def coarse(self, parameters: Array) -> Array:
         """Parameters of this sensor's units for images of every `stride`-th pixel.
@@ -97,6 +115,8 @@ class Sensor:
             k.DARK: np.where(dark, 10 ** rng.uniform(-3.0, -1.7, n), 0.0),
             k.SIDE: rng.choice([-1.0, 1.0], n),
             k.LUMPS: rng.uniform(0.2, 1.0, n) * (0.6 + 0.8 * fur),
+            k.BASELINE: self.baseline_mm,
+            k.STEPS: self.steps,
         }
         if self.kind == k.PRIMESENSE_KIND:
             columns |= {
@@ -105,6 +125,15 @@ class Sensor:
                 k.EDGE_DROP: rng.uniform(0.05, 0.5, n),
                 k.GRID: rng.uniform(3.0, 5.5, n),
                 k.JITTER: rng.uniform(0.3, 0.9, n),
+            }
+        elif self.kind == k.STEREO_KIND:
+            columns |= {
+                k.SIDE: 1.0,  # depth is that of the left view
+                k.SMOOTH: rng.uniform(0.06, 0.12, n),  # pixels of disparity, at nodes
+                k.WHITE: rng.uniform(0.02, 0.05, n),
+                k.EDGE_DROP: rng.uniform(0.05, 0.5, n),
+                k.GRID: rng.uniform(4.0, 7.0, n),  # half of a matching window
+                k.JITTER: rng.uniform(0.5, 1.5, n),
             }
         elif self.kind == k.LIGHT_FIELD_KIND:
             columns |= {
@@ -132,6 +161,8 @@ class Sensor:
                 # dark hair has a small constant depth error
                 k.BIAS: np.where(dark, rng.uniform(-2.0, 4.0, n), rng.uniform(-0.5, 1.0, n)),
             }
+        if self.exposure_ms:
+            columns[k.WEAK] = np.where(dark, rng.uniform(0.5, 2.0, n), 0.0)
         p = np.zeros((n, k.N_PARAMETERS))
         for column, values in columns.items():
             p[:, column] = values
@@ -146,9 +177,39 @@ SENSORS = (
     PRIMESENSE_SENSOR,
     KINECT_V2_SENSOR,
 )  # makes used for sessions and training windows
+
+
+def _on_sale(name: str, **facts: Any) -> Sensor:
+    """A camera by name in its first depth mode, with an ideal lens."""
+    mode = next(mode for mode in DEPTH_MODES if mode.name == name)
+    return Sensor(name, replace(mode.camera, distortion=None), unit_mm=mode.unit_mm, **facts)
+
+
+_TIME_OF_FLIGHT = {"kind": k.KINECT_V2_KIND, "exposure_ms": 12.8}
+_STEREO = {"kind": k.STEREO_KIND, "exposure_ms": 8.5, "steps": 32.0}
+# cameras that one can buy, or could until lately
+ON_SALE = (
+    *(_on_sale(name, **_TIME_OF_FLIGHT) for name in ("femto-bolt", "femto-mega", "azure-nfov")),
+    *(
+        _on_sale(name, baseline_mm=baseline_mm, **_STEREO)
+        for name, baseline_mm in (
+            ("gemini-2", 50.0),
+            ("gemini-335", 50.0),
+            ("d435", 50.0),
+            ("d455", 95.0),
+            ("d405", 18.0),
+        )
+    ),
+)
 BY_NAME = {
     sensor.name.lower().replace(" ", "-"): sensor
-    for sensor in (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, PRIMESENSE_QVGA_SENSOR, RAYTRIX_R5_SENSOR)
+    for sensor in (
+        KINECT_V2_SENSOR,
+        PRIMESENSE_SENSOR,
+        PRIMESENSE_QVGA_SENSOR,
+        RAYTRIX_R5_SENSOR,
+        *ON_SALE,
+    )
 }
 # for each noise model, cameras with a focal length and resolution that training does not use: those
 # in training are within 3 % of the makes in `SENSORS`, of the Raytrix R5 above or of the NYU camera

@@ -126,7 +126,10 @@ def tracking_sequence(
 _ANIMALS: Final = {"walk": "mouse", "swim": "fish", "gesture": "hand"}  # "move" takes any
 _SEQUENCES: Final = {f"track-{name}": name for name in SEQUENCES}
 _KINDS: Final = (*_ANIMALS, "move", *_SEQUENCES, "scene", "pair", "foreign")
-_SENSORS: Final = {"walk": ("kinect-v2", "primesense", "primesense-qvga"), "swim": ("raytrix-r5",)}
+_SENSORS: Final = {
+    "walk": tuple(name for name in BY_NAME if name != "raytrix-r5"),
+    "swim": ("raytrix-r5",),
+}
 _EXAMPLE = "synthetic:walk?seed=3&frames=300&sensor=kinect-v2&spine_mm=65"
 _BUILDS = ("other", "train")  # builds of animals in scenes: not used in training, or used
 

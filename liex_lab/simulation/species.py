@@ -49,6 +49,7 @@ from liex_lab.simulation.recording import (
     Stage,
     Take,
     distractor,
+    in_motion,
     split_of,
 )
 from liex_lab.simulation.rendering import Solid
@@ -261,7 +262,7 @@ class Species:
         if take.moving and bends is not None:
             bends = bends[:1] + waver(rng, bends.shape)
         actor = Actor(surface, length, shape, pose, girth, bends, np.ones(n, np.bool_))
-        return Stage(
+        stage = Stage(
             scene,
             self.skeleton,
             (actor,),
@@ -272,6 +273,7 @@ class Species:
             scene.still[None],
             np.zeros(n, np.int64),
         )
+        return in_motion(stage, take.sensor.exposure_ms) if take.moving else stage
 
     def training_blocks(
         self,

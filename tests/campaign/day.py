@@ -64,7 +64,14 @@ def measure(folder: Path, minutes: float, kill_after_s: float) -> dict[str, Any]
     off_h, off_min = divmod(round(7 * 60 + minutes / 2), 60)
     light = ("light.on=07:00", f"light.off={off_h:02}:{off_min:02}", "light.zone=UTC")
     setting = [word for one in light for word in ("--set", one)]
-    command = ["run", folder / "cam1_*.mcap", "--out", folder, "--no-depth", *setting]
+    command: list[str | Path] = [
+        "run",
+        folder / "cam1_*.mcap",
+        "--out",
+        folder,
+        "--no-depth",
+        *setting,
+    ]
     curve: list[tuple[float, float]] = []
     began, codes = time.monotonic(), []
     for patience_s in (kill_after_s, float("inf")):

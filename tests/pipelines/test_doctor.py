@@ -495,7 +495,7 @@ def test_a_named_camera_makes_pictures_readable_and_its_size_is_checked(tmp_path
     with open_planned(folder, named.with_settings(["camera.fx=364.0"])) as recording:
         assert recording.camera.fx == 364.0, "what is stated goes before the preset"
     wrong = named.with_settings(["camera.preset=azure-nfov"])
-    with pytest.raises(LiexError, match="has images of 640 x 576 px, but these have 512 x 424"):
+    with pytest.raises(LiexError, match="640 x 576 or 320 x 288 px, but these have 512 x 424"):
         open_planned(folder, wrong)
 
 

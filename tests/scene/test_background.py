@@ -68,7 +68,7 @@ def learned_from(change) -> BackgroundSubtraction:
 
 def test_a_camera_that_is_lifted_is_told_with_the_time() -> None:
     scene = learned_from(lambda k, depth: np.where((depth > 0) & (k >= 40), depth + 30, depth))
-    assert scene.changed is not None
+    assert isinstance(scene.changed, SceneChange)
     assert scene.changed.share > 0.9
     assert scene.changed.at_s == pytest.approx(TIMES[40], abs=0.05)
     assert scene.described().doubts[-1:] == scene.doubts

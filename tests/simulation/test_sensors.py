@@ -1,15 +1,20 @@
 """Noise models of sensors: they err as the real ones do."""
 
+import hashlib
+
 import numpy as np
 import pytest
 
 from liex_lab.simulation import _sensor_kernels as k
 from liex_lab.simulation.sensors import (
+    BY_NAME,
     KINECT_V2_SENSOR,
     PRIMESENSE_SENSOR,
     RAYTRIX_R5_SENSOR,
     Sensor,
 )
+from liex_lab.simulation.simulator import open_synthetic
+from liex_lab.simulation.species import MouseSpecies
 
 SIDE = 240
 
@@ -125,3 +130,70 @@ def test_skin_without_texture_is_unread_or_filled_and_some_is_matched_wrongly() 
     assert filled.std() > bare[bare > 0].std()
     wrong = np.abs(plenoptic(250.0, OUTLIERS=2.4) - 250.0)
     assert 0.0005 < (wrong > 8.0).mean() < 0.05
+
+
+# cameras that one can buy
+
+
+@pytest.mark.parametrize("name", ["gemini-335", "d435", "d455", "d405"])
+def test_stereo_errs_by_the_square_of_the_distance_over_focal_length_and_baseline(
+    name: str,
+) -> None:
+    sensor = BY_NAME[name]
+    spread = []
+    for distance in (500.0, 1000.0):
+        out = sensed(sensor, distance, k.STILL, typical(sensor), STEPS=1024.0)
+        spread.append(np.std(out[out > 0]) * sensor.camera.fx * sensor.baseline_mm / distance**2)
+    assert spread[0] == pytest.approx(spread[1], rel=0.15)  # px of disparity at every distance
+    assert 0.04 < spread[0] < 0.12
+
+
+def test_time_of_flight_cameras_of_today_err_by_a_millimetre_or_two() -> None:
+    sensor = BY_NAME["femto-bolt"]
+    near, far = (
+        np.std(out[out > 0])
+        for out in (sensed(sensor, mm, k.STILL, typical(sensor)) for mm in (700.0, 2500.0))
+    )
+    assert 0.4 < near < 1.5 < far < 6.0
+
+
+def test_dark_fur_is_read_with_more_noise_than_the_floor() -> None:
+    for name in ("femto-bolt", "d435"):
+        quiet, noisy = (
+            np.std(out[out > 0])
+            for out in (
+                sensed(BY_NAME[name], 800.0, k.ANIMAL, WEAK=weak, LUMPS=0.0, DARK=0.0)
+                for weak in (0.0, 2.0)
+            )
+        )
+        assert noisy / quiet == pytest.approx(3.0, rel=0.25)
+
+
+def test_only_the_edges_that_a_motion_sweeps_are_lost() -> None:
+    depth, what = block(60, 120)
+    quiet = {"NOISE": 0.0, "LUMPS": 0.0, "EDGE_DROP": 0.0, "FLYING": 0.0, "BIAS": 0.0}
+    still, moving = (
+        sensed(BY_NAME["femto-bolt"], depth, what, MOTION_U=px, **quiet) for px in (0.0, 8.0)
+    )
+    assert set(np.unique(still)) == {800.0, 900.0}
+    swept = moving != still
+    assert swept[61:119, 56:65].mean() > 0.8  # within half of the motion of an edge
+    assert swept[61:119, 115:124].mean() > 0.8
+    assert not swept[61:119, 66:114].any()
+    assert not swept[:59].any()
+    assert 0.3 < (moving[swept] == 0).mean() < 0.7
+
+
+def test_a_walking_mouse_moves_in_the_sensor_and_independent_postures_do_not() -> None:
+    moved = []
+    for moving in (True, False):
+        film = MouseSpecies().film(3, 8, sensor=BY_NAME["femto-bolt"], moving=moving)
+        moved.append(np.hypot(*film.stage.parameters[:, [k.MOTION_U, k.MOTION_V]].T).max())
+    assert 0.05 < moved[0] < 10.0
+    assert moved[1] == 0.0
+
+
+def test_sensors_that_models_were_trained_with_record_the_same_bytes_as_ever() -> None:
+    film = open_synthetic("synthetic:walk?seed=3&frames=1&sensor=primesense-qvga")
+    digest = hashlib.sha256(film.frame(0).depth.tobytes()).hexdigest()
+    assert digest.startswith("19fadd018e7594fb")

@@ -1,6 +1,7 @@
 """RFID readings say which of several animals is which, and nothing where they cannot be right."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,16 +21,16 @@ TAGS = ("ada", "bob")
 N = len(SECONDS)
 
 
-def stated(file: Path, **more: object) -> Rfid:
+def stated(file: Path, **more: Any) -> Rfid:
     antennas = {
         "A": Circle(centre=[0.0, 0.0], radius=40.0),
         "B": Circle(centre=[90.0, 0.0], radius=40.0),
     }
-    values = {"readings": str(file), "tags": [*TAGS], "antennas": antennas, **more}
-    return Rfid(**values)
+    values: dict[str, Any] = {"readings": str(file), "tags": [*TAGS], "antennas": antennas}
+    return Rfid(**values | more)
 
 
-def read(folder: Path, lines: str, arena: Arena = ARENA, **more: object) -> Readings:
+def read(folder: Path, lines: str, arena: Arena = ARENA, **more: Any) -> Readings:
     file = folder / "readings.csv"
     file.write_text(f"time_s,antenna,id\n{lines}")
     return read_readings(stated(file, **more), 10.0, 2, arena)
@@ -139,7 +140,7 @@ def test_readings_that_cannot_be_used_are_left_out_and_counted(tmp_path: Path) -
     ],
 )
 def test_a_bad_file_or_plan_is_said_in_a_sentence(
-    tmp_path: Path, lines: str, more: dict[str, object], said: str
+    tmp_path: Path, lines: str, more: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(LiexError, match=said):
         read(tmp_path, lines, **more)

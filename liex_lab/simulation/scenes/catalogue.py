@@ -12,7 +12,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.hand.simulator import HandSpecies
-from liex_lab.simulation.recording import Actor, RenderedRecording, Stage, Take
+from liex_lab.simulation.recording import Actor, RenderedRecording, Stage, Take, in_motion
 from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import (
     BOX,
@@ -224,7 +224,7 @@ class Making:
             epoch,
             offset_mm=recipe.drift_mm * warming if recipe.drift_mm else None,
         )
-        return RenderedRecording(self.take.name, stage)
+        return RenderedRecording(self.take.name, in_motion(stage, self.take.sensor.exposure_ms))
 
     @property
     def _epoch_frames(self) -> int:
