@@ -44,6 +44,7 @@ SKIPPED = {
     r"^liex dashboard ": "serves pages until it is stopped",
     r"^dandi ": "another program, which .ci/peers runs",
     r"^liex evaluate actions --tracks": "needs real mice with people's words",
+    r"ANIMAL1|^liex correct crossing ": "needs two animals; sessions/test_identities.py does it",
     r"movement\.kinematics": "another program, which .ci/peers runs",
     r"^liex (?:train|evaluate pose --animal) snake\.toml|--plan plan\.toml": (
         "trains for minutes; training/test_own_animal.py does it"
@@ -61,6 +62,7 @@ NAMES = {
     "forms/A.boris": "forms/mouse_walk.boris",
     "forms/B.boris": "forms/recording.boris",
     "NAME.": "mouse_walk.",
+    "NAME_points/": "mouse_walk_points/",
 }
 # the page that a reader has followed before; else only the folder of liex_lab is there
 AFTER = {

@@ -38,7 +38,7 @@ def actogram(animal: SessionAnimal) -> Figure | None:
         since_midnight_h + hours[name].to_numpy(float) / 3600.0 for name in ("start_s", "stop_s")
     )
     dark = ~hours["light"].to_numpy(bool)
-    seen = hours["observed_s"].to_numpy(float) > 0
+    known = hours["observed_s"].to_numpy(float) > 0
     slept = hours["sleep_by_immobility_s"] / hours["observed_s"].where(hours["observed_s"] > 0)
     times = np.flatnonzero(rate) / _PER_HOUR
     for shift in (0, 1):
@@ -61,7 +61,7 @@ def actogram(animal: SessionAnimal) -> Figure | None:
         colours = np.where(dark, INK, _LIGHT)
         axes.bar(x, 0.12, stop - start, -0.72, align="edge", color=colours, gid="light")
         y = row + 0.46 - 0.9 * slept
-        axes.hlines(y[seen], x[seen], (x + stop - start)[seen], BLUE, lw=0.9, gid="sleep")
+        axes.hlines(y[known], x[known], (x + stop - start)[known], BLUE, lw=0.9, gid="sleep")
         x, row = place(times)
         high = 0.9 * np.minimum(rate[rate > 0] / top, 1.0)
         axes.bar(x, -high, 1.0 / _PER_HOUR, row + 0.46, align="edge", color=INK, gid="activity")

@@ -40,7 +40,7 @@ OF_SESSION: dict[str, tuple[str, Callable[[SessionAnimal], Figure | None]]] = {
     "activity": ("shares of the actions over the session", times.activity),
     "actogram": ("activity by the time of day, in light and dark", days.actogram),
     "transitions": ("what follows upon what, against chance", times.transitions),
-    "interactions": ("who did what to whom, number and time", social.interaction_matrix),
+    "interactions": ("the interactions of each pair, number and time", social.interaction_matrix),
     "network": ("the group of animals and their interactions", social.interaction_network),
     "onsets": ("measures about the onsets of actions", times.aligned_curves),
     "events": ("measures about events of another instrument", times.event_curves),

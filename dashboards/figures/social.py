@@ -1,4 +1,4 @@
-"""Who did what to whom: the interactions of an arena as a matrix and as a network."""
+"""The interactions of an arena as a matrix and as a network."""
 
 import numpy as np
 import pandas as pd
@@ -41,8 +41,8 @@ def interaction_matrix(animal: SessionAnimal) -> Figure | None:
     figure, axes = one_panel((TWO_COLUMNS_MM, height + 30.0), (left, 3.0, width, height))
     axes.imshow(np.nan_to_num(share), cmap="Blues", vmin=0.0, vmax=1.5 * share.max(), aspect="auto")
     for row, column in zip(*np.nonzero(count), strict=True):
-        said = f"{count[row, column]:.0f}\n{total_s[row, column]:.1f} s"
-        axes.text(column, row, said, ha="center", va="center", size=5.5)
+        text = f"{count[row, column]:.0f}\n{total_s[row, column]:.1f} s"
+        axes.text(column, row, text, ha="center", va="center", size=5.5)
     name_rows(axes, pairs)
     axes.set_xticks(range(len(words)), [word.replace("_", " ") for word in words])
     axes.tick_params(axis="x", top=True, labeltop=True, bottom=False, labelbottom=False, length=0)
@@ -102,12 +102,12 @@ def interaction_network(animal: SessionAnimal) -> Figure | None:
     axes.set_axis_off()
     heading(
         figure,
-        f"Who did something to whom, {arena_name(animal.session)}: arrows are\n"
+        f"Interactions of {arena_name(animal.session)}: arrows are\n"
         "interactions that are not mutual (number and time), grey is contact\n"
         "(share of the time in which both have a trusted pose)",
     )
     return figure
 
 
-def _label(axes: Axes, at: Array, said: str, colour: str) -> None:
-    halo(axes.text(at[0], at[1], said, ha="center", va="center", color=colour))
+def _label(axes: Axes, at: Array, label: str, colour: str) -> None:
+    halo(axes.text(at[0], at[1], label, ha="center", va="center", color=colour))

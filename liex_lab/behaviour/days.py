@@ -147,15 +147,15 @@ def activity_by_hour(kinematics: pd.DataFrame, light: Light, hold: Array) -> pd.
 def immobile_spans(kinematics: pd.DataFrame, light: Light) -> Array:
     """Starts and stops (k, 2) of the animal's sleep by immobility, s since the first frame."""
     time_s = kinematics["time_s"].to_numpy(float)
-    seen = np.isfinite(kinematics["x_mm"].to_numpy(float))
-    second = (time_s - time_s[0]).astype(np.int64)[seen]
+    observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
+    second = (time_s - time_s[0]).astype(np.int64)[observed]
     n = int(time_s[-1] - time_s[0]) + 1
     count = np.bincount(second, minlength=n)
     count[count < 0.5 * count.max()] = 0
     moved = np.zeros(n - 1)
     for name in ("x_mm", "y_mm", "z_mm", "nose_height_mm", "reach_mm"):
         if name in kinematics:
-            values = np.bincount(second, kinematics[name].to_numpy(float)[seen], n)
+            values = np.bincount(second, kinematics[name].to_numpy(float)[observed], n)
             moved += np.diff(_ratio(values, count)) ** 2
     still = np.concatenate([[False], moved < light.still_mm_s**2, [False]])
     start, stop = (np.flatnonzero(np.diff(still.astype(int)) == sign) for sign in (1, -1))

@@ -364,15 +364,17 @@ class _Arena:
 
     def _of_pair(self, i: int, j: int) -> Iterator[_Event]:
         """The interactions of two animals."""
-        seen = [self.observed(i, j, mutual=mutual) for mutual in (False, True)]
-        numbers = [segments(self.time_s, one) for one in seen]
+        observable = [self.observed(i, j, mutual=mutual) for mutual in (False, True)]
+        numbers = [segments(self.time_s, one) for one in observable]
         ways = ((i, j), (j, i))
         margins = {way: self._margins(*way, numbers[False]) for way in ways}
-        free = {way: seen[True].copy() for way in ways}
-        done = {word: np.zeros(len(seen[True]), np.bool_) for word in WORDS}  # by either animal
+        free = {way: observable[True].copy() for way in ways}
+        done = {
+            word: np.zeros(len(observable[True]), np.bool_) for word in WORDS
+        }  # by either animal
         for word in (word for word in WORDS if word in margins[ways[0]]):
             rule = WORDS[word]
-            observed, number = seen[rule.mutual], numbers[rule.mutual]
+            observed, number = observable[rule.mutual], numbers[rule.mutual]
             without = np.any([done[one] for one in rule.not_in], axis=0)
             for way in ways[:1] if rule.mutual else ways:
                 taken = ways if rule.mutual else (way,)

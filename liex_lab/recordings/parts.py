@@ -73,7 +73,7 @@ class _OpenParts:
         self._starts = np.cumsum([0, *(len(part.times_ns) for part in parts)])
         self._open: dict[int, Recording] = {}
         self._lock = Lock()
-        self.problems = _said(parts, "problems")
+        self.problems = _messages(parts, "problems")
 
     def read(self, number: int) -> Depth:
         """Depth of a frame by its number in the whole recording."""
@@ -151,7 +151,7 @@ def join_parts(
             f"{paths[0].parent} holds several recordings: {error}; give one of these in it: {offer}"
         ) from None
     opened = _OpenParts(parts, open_part)
-    doubts = [*_said(parts, "doubts"), *_order_doubt(parts)]
+    doubts = [*_messages(parts, "doubts"), *_order_doubt(parts)]
     opened.problems += _pauses(parts)
     return Recording(
         name=_common_name(paths),
@@ -241,7 +241,7 @@ def _pauses(parts: Sequence[_Part]) -> list[str]:
     ]
 
 
-def _said(parts: Sequence[_Part], what: str) -> list[str]:
+def _messages(parts: Sequence[_Part], what: str) -> list[str]:
     """The sentences of all parts, each once, with the part's name unless all state it."""
     by: dict[str, list[str]] = {}
     for part in parts:

@@ -245,9 +245,9 @@ class HypothesisAssociation:
 def _undirected(observed: Observations) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Frames (k,) and hypotheses (k,) that score as their reversal and have a larger error.
 
-    The image does not tell these ends apart. Nor may the jitter of two fits: over a long contact it
-    would outweigh the directions before and after. The transitions of both directions are therefore
-    those of the better fit, and the cost of a half turn is all that separates them.
+    The image does not distinguish these ends. Nor may the jitter of two fits: over a long contact
+    it would outweigh the directions before and after. The transitions of both directions are
+    therefore those of the better fit, and the cost of a half turn is all that separates them.
     """
     other = np.arange(observed.score.shape[1]) ^ 1
     tied = observed.score == observed.score[:, other]

@@ -139,14 +139,20 @@ def _by_tags(
     totals = [of_animals[reading[:, 0], np.array(one[3])[tag]].sum() for one in found]
     certain = 1.0 / np.exp(min(totals) - np.array(totals)).sum()
     is_off = of_animals[reading[:, 0], np.array(carriers)[tag]] > _OFF
-    said = f"at {is_off.sum()} of {len(tag)} RFID readings the animal is not at the antenna"
-    told = Identity(states[best], (), remarks=(*readings.remarks, *[said] * bool(is_off.any())))
+    misplaced = f"at {is_off.sum()} of {len(tag)} RFID readings the animal is not at the antenna"
+    known = Identity(
+        states[best], (), remarks=(*readings.remarks, *[misplaced] * bool(is_off.any()))
+    )
     if not len(tag) or is_off.mean() > 0.5 or certain < CERTAIN:
-        why = said if is_off.any() else f"{len(tag)} RFID readings do not distinguish the animals"
+        why = (
+            misplaced
+            if is_off.any()
+            else f"{len(tag)} RFID readings do not distinguish the animals"
+        )
         advice = "check animal.rfid.antennas and offset_s; the tags were not used"
-        return path, sizes, replace(told, misfits=(f"{why}: {advice}",))
+        return path, sizes, replace(known, misfits=(f"{why}: {advice}",))
     names = dict(zip(carriers, readings.tags, strict=True))
-    return best, emission, replace(told, tags=tuple(names.get(k, "") for k in range(n_animals)))
+    return best, emission, replace(known, tags=tuple(names.get(k, "") for k in range(n_animals)))
 
 
 def own_observations(observed: Observations, slots: Slots) -> Observations:

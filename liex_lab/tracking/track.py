@@ -252,7 +252,7 @@ class Crossing:
         animals: which of them, from 0.
         p_swap: probability that they leave it in other roles than in the tracks.
         decided_by: what decided it: motion, size or rfid, or human.
-        reviewed_by: the person who reviewed it; "" if nobody did.
+        reviewed_by: the reviewer; "" if nobody did.
         reviewed_at: when, ISO 8601.
     """
 

@@ -1,8 +1,8 @@
 """Reader of MoSeq's extractions, results_00.h5: full depth images from cut-outs of the animal.
 
 moseq2-extract keeps of every frame the height over the background in a square about the animal,
-cut at whole pixels, turned until the animal faces right, and, where a classifier said so, turned by
-half a turn more:
+cut at whole pixels, turned until the animal faces right, and, where a classifier decided it, turned
+by half a turn more:
 
     cut-out(q) = height(R(angle) (q - c) + c + corner),   corner = trunc(centroid - side / 2),
     c = (side / 2, side / 2),   height = whole mm of background - depth, 0 outside of [low, high].
@@ -271,7 +271,7 @@ class _Results:
         if raw is None or raw.shape != self.scene.shape or isinstance(frame, str):
             doubts.append(
                 "the file holds no raw first frame, with which frames put together again could be "
-                "compared; look at the replay before you trust them"
+                "compared; check the replay before you trust them"
             )
             return
         animal = (frame != self.scene) & (frame > 0) & (raw > 0)
@@ -287,7 +287,7 @@ class _Results:
 
 
 def _array(file: h5py.File, *names: str) -> NDArray[Any] | None:
-    """The first of these data sets that the file holds; None if there is none or it is empty."""
+    """The first of these data sets that the file holds; None if it has none or it is empty."""
     for name in names:
         found = file.get(name)
         if getattr(found, "shape", None) is not None:
