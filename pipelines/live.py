@@ -8,6 +8,7 @@ of the online tracker (`triggers`).
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, nullcontext
 from itertools import chain, islice, tee
 from pathlib import Path
 from typing import Any
@@ -78,24 +79,23 @@ def follow_live(
         check_unused(durable.inside(Path(out), plan.session.name or arriving.name, ".liex"), False)
     if watch is not None:
         watch.write_to(durable.inside(Path(out or "."), arriving.name, ".triggers.jsonl"))
-    numbers, _ = track_live(
-        arriving,
-        plan,
-        progress=progress,
-        watch=watch,
-        viewer=None
-        if to == "none"
-        else lambda tracker, arriving: LiveView(
-            arriving.name,
-            arriving.camera,
-            tracker.subject.T_arena_camera,
-            tracker.subject.skeleton,
-            to,
-            live_blueprint(tracker.subject.length_mm / 1000.0),
-        ),
-    )
-    if watch is not None:
-        watch.close()
+    with nullcontext() if watch is None else closing(watch):
+        numbers, _ = track_live(
+            arriving,
+            plan,
+            progress=progress,
+            watch=watch,
+            viewer=None
+            if to == "none"
+            else lambda tracker, arriving: LiveView(
+                arriving.name,
+                arriving.camera,
+                tracker.subject.T_arena_camera,
+                tracker.subject.skeleton,
+                to,
+                live_blueprint(tracker.subject.length_mm / 1000.0),
+            ),
+        )
     if out is not None:
         path = run_session(source, plan, out, further=watch, progress=progress)
         numbers["session"] = str(path)

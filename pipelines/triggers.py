@@ -99,7 +99,7 @@ class TriggerWatch:
         elif not why_nameless(plan, skeleton):
             words = tuple(MouseRules().definitions())
         known = usable_names(skeleton, words, [zone.name for zone in build_zones(plan)])
-        self._rules = [Rule.of_text(text, known) for text in stated.rules]
+        self._rules = [Rule.of_text(text, known) for text in dict.fromkeys(stated.rules)]
         self._names = {name for rule in self._rules for name in rule.names}
         self._acts = {name: words_in(name, words) for name in self._names & {*words, "rear"}}
         self._acting = dict.fromkeys(self._acts, False)
@@ -157,7 +157,9 @@ class TriggerWatch:
                 self._fire(k, arrival, time_s, float(values[rule.names[0]][0]))
 
     def close(self) -> None:
-        """Close the log, and account for the events of each rule."""
+        """Close senders and log, and account for the events of each rule."""
+        for sender in self._senders.values():
+            sender.close()
         if self._log is not None:
             self._log.close()
         self.accounts = [self._account(k) for k in range(len(self._rules))]
@@ -225,7 +227,8 @@ class TriggerWatch:
             chance = {words_of(bouts, rows.time_s)[-1]: 1.0}
         for name, kinds in self._acts.items():
             p = sum(chance.get(kind, 0.0) for kind in kinds)
-            self._acting[name] = p > (0.2 if self._acting[name] else 0.8)
+            if not np.isnan(p):  # else nothing was measured
+                self._acting[name] = bool(p > (0.2 if self._acting[name] else 0.8))
 
     def _rows(self, track: Track) -> Rows:
         return Rows(track, np.arange(track.n_frames), "", "", (), self._arena, self._zones)
@@ -249,9 +252,9 @@ class TriggerWatch:
         withheld = self._rng.random() >= self._stated.probability
         late = time.perf_counter() - arrival.at_s > _LATE_S
         outcome = "late" if late else "withheld" if withheld else "sent"
-        for address, send in self._senders.items() if outcome == "sent" else ():
+        for address, sender in self._senders.items() if outcome == "sent" else ():
             try:
-                send(message(facts))
+                sender.send(message(facts))
             except Exception as error:  # other packages raise no common type; measuring goes on
                 outcome = "failed"
                 self.problems.setdefault(address, one_line(error))

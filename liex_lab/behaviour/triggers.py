@@ -2,9 +2,9 @@
 
 A rule is a condition, with `until` another one: from the frame in which it begins to hold until the
 one in which the other holds (hysteresis: speed_mm_s > 200 until speed_mm_s < 150). The text is
-parsed as a Python expression of names, numbers, comparisons, arithmetic, `abs`, `and`, `or` and
-`not`; anything else is refused, and nothing is executed. A condition on a column without a value in
-a frame neither holds nor fails there.
+parsed as a Python expression of names, numbers, comparisons, `and`, `or` and `not`; anything else
+is refused, and nothing is executed. A condition on a column without a value in a frame neither
+holds nor fails there.
 
 The same rule is applied to the rows of an ongoing recording and to the finished session, and the
 events of both are matched one to one. An event of the session is a span, from the onset to the end
@@ -41,12 +41,7 @@ _UNUSABLE = (*_LATER, "time_s", "dt_s", "step_mm", "below_surface_mm")  # and un
 _FORM = (
     "write an action, `in ZONE`, or columns compared with numbers: speed_mm_s > 200 and not in nest"
 )
-_FREE: tuple[type[ast.AST], ...] = (ast.Add, ast.Sub, ast.Mult, ast.Div)
 _OPERATORS: dict[type[ast.AST], Any] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: np.divide,
     ast.USub: operator.neg,
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
@@ -119,7 +114,7 @@ class Rule:
             if _unit(condition, known) != TRUTH:
                 raise PlanError(f"the trigger '{text}' compares nothing; {_FORM}")
         nodes = [node for condition in (on, *off) for node in ast.walk(condition)]
-        names = [node.id for node in nodes if isinstance(node, ast.Name) and node.id != "abs"]
+        names = [node.id for node in nodes if isinstance(node, ast.Name)]
         if not names:
             raise PlanError(f"the trigger '{text}' names no column, action or zone; {_FORM}")
         return Rule(text, tuple(dict.fromkeys(names)), on, *off)
@@ -130,9 +125,8 @@ class Rule:
         Args:
             values: (n,) each of its names, NaN if unknown; there neither is true.
         """
-        with np.errstate(divide="ignore", invalid="ignore"):
-            on = np.asarray(_value(self.on, values)) != 0.0
-            off = ~on if self.off is None else np.asarray(_value(self.off, values)) != 0.0
+        on = np.asarray(_value(self.on, values)) != 0.0
+        off = ~on if self.off is None else np.asarray(_value(self.off, values)) != 0.0
         known = np.isfinite([values[name] for name in self.names]).all(axis=0)
         return on & known, off & known
 
@@ -146,19 +140,12 @@ def _unit(node: ast.expr, known: Mapping[str, str]) -> str | None:
             return known[name]
         case ast.Name(id=name):
             raise PlanError(_unknown(name, known))
-        case ast.Call(func=ast.Name(id="abs"), args=[part], keywords=[]):
-            return _unit(part, known)
         case ast.UnaryOp(op=ast.USub(), operand=part):
             return _unit(part, known)
         case ast.UnaryOp(op=ast.Not(), operand=part):
             parts = [part]
         case ast.BoolOp(values=parts):
             pass
-        case ast.BinOp(left=left, op=op, right=right) if type(op) in _FREE:
-            units = [_unit(left, known), _unit(right, known)]
-            if isinstance(op, ast.Mult | ast.Div):
-                return units[0] if units[1] is None else None
-            return _common(node, units)
         case ast.Compare(left=left, ops=ops, comparators=right) if all(
             type(op) in _OPERATORS for op in ops
         ):
@@ -177,7 +164,7 @@ def _unit(node: ast.expr, known: Mapping[str, str]) -> str | None:
 
 
 def _common(node: ast.expr, units: Sequence[str | None]) -> str | None:
-    """The unit of values that are compared or added."""
+    """The unit of values that are compared."""
     stated = sorted({unit for unit in units if unit is not None})
     if TRUTH in stated or len(stated) > 1:
         raise PlanError(
@@ -232,12 +219,8 @@ def _value(node: ast.AST, values: Mapping[str, Array]) -> Any:
             return values[name]
         case ast.Constant(value=number):
             return number
-        case ast.Call(args=[part]):
-            return np.abs(_value(part, values))
         case ast.UnaryOp(op=op, operand=part):
             return _OPERATORS[type(op)](_value(part, values))
-        case ast.BinOp(left=left, op=op, right=right):
-            return _OPERATORS[type(op)](_value(left, values), _value(right, values))
         case ast.BoolOp(op=op, values=parts):
             return reduce(_OPERATORS[type(op)], (_value(part, values) for part in parts))
     assert isinstance(node, ast.Compare)

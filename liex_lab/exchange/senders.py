@@ -7,7 +7,7 @@ dead does not hold up the measurement.
 import json
 import socket
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from liex_lab.errors import (
@@ -17,13 +17,25 @@ from liex_lab.errors import (
     how_to_install,
     one_line,
 )
+from liex_lab.recordings.recording import closing_on_error
 
-Send = Callable[[str], object]
 _BAUD = 115_200
 
 
-def open_sender(address: str) -> Send:
-    """A function that sends a line of text to an address, and raises OSError if that fails.
+class Sender(NamedTuple):
+    """A way to a receiver.
+
+    Attributes:
+        send: sends a line of text; raises what its package raises if that fails.
+        close: ends it.
+    """
+
+    send: Callable[[str], object]
+    close: Callable[[], object]
+
+
+def open_sender(address: str) -> Sender:
+    """A way to the receivers at an address.
 
     Args:
         address: udp://HOST:PORT; zmq://HOST:PORT, at which subscribers connect (PUB); lsl://NAME, a
@@ -59,25 +71,26 @@ def message(facts: Mapping[str, Any]) -> str:
     return json.dumps(facts, allow_nan=False) + "\n"
 
 
-def _udp(address: str) -> Send:
+def _udp(address: str) -> Sender:
     host, port = _host_port(address)
     family, kind, protocol, _, target = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
     link = socket.socket(family, kind, protocol)
     link.setblocking(False)
-    return lambda line: link.sendto(line.encode(), target)
+    return Sender(lambda line: link.sendto(line.encode(), target), link.close)
 
 
-def _zmq(address: str) -> Send:
+def _zmq(address: str) -> Sender:
     import zmq
 
     host, port = _host_port(address)
     publisher: Any = zmq.Context.instance().socket(zmq.PUB)
     publisher.setsockopt(zmq.LINGER, 200)  # ms, for the last messages at the end
-    publisher.bind(f"tcp://{host}:{port}")
-    return publisher.send_string
+    with closing_on_error(publisher):
+        publisher.bind(f"tcp://{host}:{port}")
+    return Sender(publisher.send_string, publisher.close)
 
 
-def _lsl(address: str) -> Send:
+def _lsl(address: str) -> Sender:
     import pylsl
 
     name = address.partition("://")[2]
@@ -85,14 +98,14 @@ def _lsl(address: str) -> Send:
         raise ValueError("the stream has no name")
     about = pylsl.StreamInfo(name, "Markers", 1, pylsl.IRREGULAR_RATE, pylsl.cf_string, name)
     outlet = pylsl.StreamOutlet(about)
-    return lambda line: outlet.push_sample([line.rstrip()])
+    return Sender(lambda line: outlet.push_sample([line.rstrip()]), lambda: None)
 
 
-def _serial(address: str) -> Send:
+def _serial(address: str) -> Sender:
     import serial
 
     port = serial.Serial(urlsplit(address).path, _BAUD, write_timeout=0)
-    return lambda line: port.write(line.encode())
+    return Sender(lambda line: port.write(line.encode()), port.close)
 
 
 def _host_port(address: str) -> tuple[str, int]:
