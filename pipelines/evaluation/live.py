@@ -5,9 +5,10 @@ sends them through a local socket at the camera's pace, forwards and backwards: 
 latency, ms, of all frames since the first one that arrived after its predecessors were processed,
 which excludes learning the background.
 
-With rules, another process receives their messages by UDP: `message_p95_ms` is from the arrival of
-a frame to that of its message. Their agreement with the finished session is measured on a second,
-uninterrupted recording of as many frames, each of which is followed as soon as it is rendered.
+With rules, a message of each of them is sent for every frame, and another process receives it by
+UDP: `message_p95_ms` is from the arrival of the frame to that of its message, of the same frames.
+Their agreement with the finished session is measured on a second, uninterrupted recording of as
+many frames, each of which is followed as soon as it is rendered.
 """
 
 import multiprocessing
@@ -23,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from liex_lab.behaviour.triggers import Onsets, Rule
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.recordings import streaming
 from liex_lab.runtime.progress import Progress, silent
@@ -160,8 +162,7 @@ def _triggered(
     watches: list[TriggerWatch] = []
 
     def watch() -> TriggerWatch:
-        stated = Triggers(tuple(rules), (f"udp://127.0.0.1:{port}",))
-        watches.append(TriggerWatch(stated, plan))
+        watches.append(_EveryFrame(Triggers(tuple(rules), (f"udp://127.0.0.1:{port}",)), plan))
         return watches[-1]
 
     numbers = film(watches=watch)
@@ -169,11 +170,12 @@ def _triggered(
         link.sendto(b"", ("127.0.0.1", port))
     received_ns = here.recv()
     receiver.join()
-    sent = [event for event in watches[-1].events if event["outcome"] == "sent"]
-    ms = [
+    sent = [one for each in watches for one in each.events if one["outcome"] == "sent"]
+    every_ms = [
         event["latency_ms"] + 1e-6 * (at_ns - event["sent_time_ns"])
-        for event, at_ns in zip(sent, received_ns[len(received_ns) - len(sent) :], strict=True)
+        for event, at_ns in zip(sent, received_ns, strict=True)
     ]
+    ms = every_ms[len(every_ms) - numbers["n_live"] * len(rules) :]
     quantiles = np.quantile(ms, [0.5, 0.95]).tolist() if ms else [None, None]
     numbers |= dict(zip(("message_median_ms", "message_p95_ms"), quantiles, strict=True))
     whole = world_of(Skeleton.load(animal)).motion(_SEED + 1, n_frames)
@@ -185,6 +187,18 @@ def _triggered(
     with tempfile.TemporaryDirectory() as folder:
         run_session(whole, plan, folder, further=follower, report=False, progress=progress)
     return {**numbers, "n_messages": len(ms), "triggers": follower.accounts}
+
+
+class _EveryFrame(TriggerWatch):
+    """Sends a message of every rule for each frame, whether the rule holds or not."""
+
+    def _new_onsets(self, rule: Rule) -> Onsets:
+        return _Always()
+
+
+class _Always(Onsets):
+    def add(self, time_s: float, on: bool, off: bool) -> bool:
+        return True
 
 
 def _receive(report: Connection) -> None:
