@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.session import run_demo, run_session
     from liex_lab.pipelines.study.status import SessionStatus
     from liex_lab.pipelines.sync import sync_session
+    from liex_lab.pipelines.triggers import Triggers
     from liex_lab.pipelines.verify import verify_session
 
 _JOBS = {  # function: the module of `pipelines` that defines it
@@ -41,6 +42,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "draw_figures": "drawing",
     "export_video": "drawing",
     "follow_live": "live",
+    "Triggers": "triggers",
     "import_animals": "points",
     "import_points": "points",
     "run_demo": "session",
@@ -62,7 +64,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "evaluate_reference": "evaluation.pose",
     "evaluate_speed": "evaluation.speed",
     "evaluate_recordings": "evaluation.speed",
-    "evaluate_live": "evaluation.speed",
+    "evaluate_live": "evaluation.live",
     "evaluate_report": "evaluation.scale",
     "evaluate_statistics": "evaluation.statistics",
     "evaluate_sync": "evaluation.sync",
@@ -93,6 +95,7 @@ __all__ = [  # noqa: RUF022 - in the order of the manual
     "describe_session",
     "sync_session",
     "follow_live",
+    "Triggers",
     "import_points",
     "import_animals",
     "run_demo",

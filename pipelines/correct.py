@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -293,7 +294,7 @@ def _apply(
     written = behaviour.tables
     problems = [*raw.metadata["problems"], *found.remarks]
     if together is not None:
-        written = {**written, **together.for_session(raw.name)["results"]}
+        written = {**written, **together.for_session(rows, behaviour.tables)["results"]}
     elif log.shared:  # as they were when identities were corrected last
         for name in INTERACTION_TABLES:
             shutil.copy2(Session.open(raw.path).file(f"{name}.parquet"), folder)
@@ -309,8 +310,9 @@ def _apply(
         written = {
             name: table for name, table in written.items() if name not in ("kinematics", "zones")
         }
-    more = schema.INTERACTIONS if raw.has("interactions.parquet") else ()
-    results.write_measured(folder, written, (*behaviour.columns, *more))
+    described = {"interactions": schema.INTERACTIONS, "triggers": schema.TRIGGERS}
+    more = [each for name, each in described.items() if raw.has(f"{name}.parquet")]
+    results.write_measured(folder, written, (*behaviour.columns, *chain(*more)))
     facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}
     if problems != raw.metadata["problems"]:
         facts["problems"] = problems

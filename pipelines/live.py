@@ -2,11 +2,13 @@
 
 `liex live` learns background, floor and size from the first frames, then measures each frame and
 passes it to the online tracker, which has no lag; frames that have waited are measured in batches.
-At the end of the recording the offline tracker computes the whole track.
+At the end of the recording the offline tracker computes the whole track. Rules trigger on the rows
+of the online tracker (`triggers`).
 """
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, nullcontext
 from itertools import chain, islice, tee
 from pathlib import Path
 from typing import Any
@@ -18,12 +20,15 @@ from liex_lab.errors import RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings import recording, streaming
 from liex_lab.recordings.frame import marked
+from liex_lab.runtime import durable
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions.viewer import LiveView, need_screen
 from liex_lab.tracking import curve, observations, track
 from liex_lab.tracking.tracker import FrameTracker
 
 from .build import build_recording, build_tracker
+from .session import check_unused, run_session
+from .triggers import Triggers, TriggerWatch
 
 
 def follow_live(
@@ -33,6 +38,8 @@ def follow_live(
     replay: bool = False,
     to: str = "viewer",
     patience_s: float = 3.0,
+    triggers: Triggers | None = None,
+    out: str | Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Show the skeletons of an ongoing recording in a Rerun viewer; returns measured latencies.
@@ -42,35 +49,66 @@ def follow_live(
             recording.
         plan: all settings of the run.
         replay: play back a finished recording at its own pace, as if it were live.
-        to: 'viewer' starts a viewer on this machine; else a viewer's address, or an .rrd file.
+        to: 'viewer' starts a viewer on this machine; 'none' shows nothing; else a viewer's address,
+            or an .rrd file.
         patience_s: time without growth after which a file counts as finished, s.
+        triggers: rules whose events are sent and logged; None for none.
+        out: parent of the session that is made of the recording when it is over, and of the log of
+            events; None makes no session, and writes the log to the current folder.
         progress: receives the number of processed frames.
 
     Returns:
         Numbers: name, n_frames, n_live (frames whose latency was measured), latency_median_ms and
-            latency_p95_ms (None if absent), n_measured, n_bridged.
+            latency_p95_ms (None if absent), n_measured, n_bridged; with triggers, `triggers`: what
+            became of the events of each rule, and, with a session, their agreement with its own.
 
     Raises:
-        LiexError: the source ends before its first frame, cannot be read, or there is no screen for
-            a viewer.
+        LiexError: the source ends before its first frame, cannot be read, there is no screen for a
+            viewer, a rule or receiver cannot be used, or the session cannot be written.
     """
     if to == "viewer":  # fail early, before a wait of minutes
         need_screen("write a file with --to NAME.rrd, which any viewer opens")
+    watch = TriggerWatch(triggers, plan) if triggers is not None else None
+    if out is not None and not replay and _address(source):
+        raise RecordingError(
+            f"{source} sends frames and leaves no recording of which a session can be made; follow "
+            "the file that is being written, or leave out --out"
+        )
     arriving = open_live(source, plan, replay=replay, patience_s=patience_s)
-    numbers, _ = track_live(
-        arriving,
-        plan,
-        progress=progress,
-        viewer=lambda tracker, arriving: LiveView(
-            arriving.name,
-            arriving.camera,
-            tracker.subject.T_arena_camera,
-            tracker.subject.skeleton,
-            to,
-            live_blueprint(tracker.subject.length_mm / 1000.0),
-        ),
-    )
+    if out is not None:
+        check_unused(durable.inside(Path(out), plan.session.name or arriving.name, ".liex"), False)
+    if watch is not None:
+        watch.write_to(durable.inside(Path(out or "."), arriving.name, ".triggers.jsonl"))
+    with nullcontext() if watch is None else closing(watch):
+        numbers, _ = track_live(
+            arriving,
+            plan,
+            progress=progress,
+            watch=watch,
+            viewer=None
+            if to == "none"
+            else lambda tracker, arriving: LiveView(
+                arriving.name,
+                arriving.camera,
+                tracker.subject.T_arena_camera,
+                tracker.subject.skeleton,
+                to,
+                live_blueprint(tracker.subject.length_mm / 1000.0),
+            ),
+        )
+    if out is not None:
+        path = run_session(source, plan, out, further=watch, progress=progress)
+        numbers["session"] = str(path)
+    if watch is not None:
+        numbers |= {"triggers": watch.accounts, "failed_receivers": watch.problems}
     return numbers
+
+
+def _address(source: str) -> tuple[str, int] | None:
+    """Host and port of a sender; None for a file or folder."""
+    host, colon, port = source.rpartition(":")
+    is_address = colon and port.isdigit() and not Path(source).exists()
+    return (host, int(port)) if is_address else None
 
 
 def open_live(
@@ -87,9 +125,8 @@ def open_live(
     partial = plan.with_settings(["recording.accept_truncated=true"])
     if replay:
         return streaming.replayed(build_recording(source, plan))
-    host, colon, port = source.rpartition(":")
-    if colon and port.isdigit() and not Path(source).exists():
-        return streaming.received(host, int(port))
+    if address := _address(source):
+        return streaming.received(*address)
     return streaming.growing(lambda: build_recording(source, partial), patience_s)
 
 
@@ -99,6 +136,7 @@ def track_live(
     *,
     learn_frames: int = 90,  # to learn the background, the floor and the animal's size from
     viewer: Callable[[FrameTracker, streaming.Arriving], Any] | None = None,
+    watch: TriggerWatch | None = None,
     progress: Progress = silent,
 ) -> tuple[dict[str, Any], track.Tracked]:
     """Track a recording as its frames arrive; returns latencies and the smoothed track.
@@ -111,6 +149,7 @@ def track_live(
         plan: how the recording is measured.
         learn_frames: frames that background, floor and size are learned from.
         viewer: makes a viewer from tracker and source, which displays each frame with its row.
+        watch: applies rules to each frame; None for no triggers.
         progress: called frame by frame.
 
     Returns:
@@ -136,6 +175,8 @@ def track_live(
     tracker = build_tracker(first, plan)
     online = curve.OnlineTracker(tracker.subject)
     view = viewer(tracker, arriving) if viewer else None
+    if watch is not None:
+        watch.begin(tracker)
     history = []
     latency = list[float]()
     worked_until = time.perf_counter()
@@ -145,8 +186,11 @@ def track_live(
         estimates = tracker.observe([arrival.frame for arrival in some])
         for k, arrival in enumerate(some):
             history.append(estimates[k : k + 1])
-            row: track.Track | None = online.add(history[-1])
-            if view is not None and row is not None:
+            row = online.add(history[-1])
+            assert row is not None  # without a lag
+            if watch is not None:
+                watch.add(arrival, online.recent)
+            if view is not None:
                 view.show(arrival.frame, row)
             worked_until = time.perf_counter()
             if keeping_up:

@@ -32,7 +32,6 @@ from liex_lab.actions import ethogram, timeline, vocabulary
 from liex_lab.behaviour import summary
 from liex_lab.behaviour.bouts import recognise
 from liex_lab.behaviour.days import Light
-from liex_lab.behaviour.interactions import Interactions
 from liex_lab.catalog import DEMO, find_sample
 from liex_lab.errors import PlanError, RecordingError
 from liex_lab.optics.camera import unusual_centre, unusual_lens
@@ -202,6 +201,13 @@ HEAVY = ("rerun", "scipy.special", "matplotlib.figure", "matplotlib.backends.bac
 Seen = TypeVar("Seen", covariant=True)
 
 
+class Further(Protocol):
+    """Measures of a session beyond those of its animal's track."""
+
+    def for_session(self, rows: Rows, measured: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+        """Tables, descriptions of their columns and notes, as `SessionWriter.close` takes them."""
+
+
 class Observer(Protocol[Seen]):
     """A tracker of one animal or of several."""
 
@@ -282,6 +288,7 @@ def run_session(
     workers: int = 1,
     pool: processes.WorkerPool | None = None,
     report: bool = True,
+    further: Further | None = None,
     progress: Progress = silent,
 ) -> Path:
     """Measure every frame of a depth recording and write a session folder; returns its path.
@@ -306,6 +313,7 @@ def run_session(
             "__main__":`, as processes are spawned.
         pool: a worker pool to use instead of `workers` local processes.
         report: whether to write the report with its figures.
+        further: measures to add, such as those of a live recording's triggers.
         progress: receives progress reports.
 
     Returns:
@@ -352,7 +360,7 @@ def run_session(
         with prepared.writing(overwrite, report) as writer:
             with closing(read_ahead(prepared.recording, writer.n_frames)) as chunks:
                 prepared.measure_all(chunks, writer, progress)
-            return prepared.finish(writer, recording, notes).path
+            return prepared.finish(writer, recording, notes, further).path
 
 
 def run_demo(out: str | Path = ".", *, progress: Progress = silent) -> Path:
@@ -480,6 +488,7 @@ class Prepared:
         writer: SessionWriter,
         source: str | Path | Recording,
         notes: Mapping[str, Any] | None = None,
+        further: Further | None = None,
     ) -> Session:
         """Make track, behaviour and tables, and move the session to its folder.
 
@@ -488,9 +497,10 @@ class Prepared:
             source: path or address of the recording, to which the session links; there is no link
                 to an open recording.
             notes: additional contents of session.json.
+            further: measures to add; None for none.
         """
         self.follow(writer)
-        return self.conclude(writer, source, notes)
+        return self.conclude(writer, source, notes, further)
 
     def follow(
         self,
@@ -530,7 +540,7 @@ class Prepared:
         writer: SessionWriter,
         source: str | Path | Recording,
         notes: Mapping[str, Any] | None = None,
-        together: Interactions | None = None,
+        further: Further | None = None,
     ) -> Session:
         """Make behaviour and tables of a track, and move the session to its folder.
 
@@ -538,12 +548,12 @@ class Prepared:
             writer: has the track.
             source: as for `finish`.
             notes: additional contents of session.json.
-            together: the interactions of all animals of the arena; None for one animal.
+            further: measures to add, such as the interactions of all animals of the arena.
         """
         if isinstance(source, str | Path):
             writer.note(input=evidence.link_to(source, self.folder))
         writer.note(**dict(notes or {}))
-        return conclude(writer, self.fitted.plan, self.timings, together)
+        return conclude(writer, self.fitted.plan, self.timings, further)
 
 
 def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) -> Prepared:
@@ -650,7 +660,7 @@ def conclude(
     writer: SessionWriter,
     plan: Plan,
     timings: dict[str, float],
-    together: Interactions | None = None,
+    further: Further | None = None,
 ) -> Session:
     """Measure the behaviour and move the session to its folder; returns the finished session.
 
@@ -658,14 +668,14 @@ def conclude(
         writer: has all frames and their track.
         plan: rules and action model.
         timings: seconds of each part of the work so far.
-        together: the interactions of all animals of the arena; None for one animal.
+        further: measures to add, such as the interactions of all animals of the arena.
     """
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes, problems=_refused_sentence(notes))
     memory.release_memory()
     closing = behaviour.for_session()
-    if together is not None:
-        more = together.for_session(writer.origin.name)
+    if further is not None:
+        more = further.for_session(writer.rows, behaviour.tables)
         closing["results"] |= more["results"]
         closing["columns"] += more["columns"]
         closing["record"] |= more["record"]

@@ -110,6 +110,9 @@ CHANGED = {
     },
     "docs/howto/sync.md": {"liex sync": f"{PULSES}liex sync"},
     "docs/howto/interactions.md": {"several.json": "several.json --frames 300 --recordings 1"},
+    "docs/howto/trigger.md": {
+        "liex live SOURCE": "liex live 'synthetic:walk?seed=3&frames=40' --replay"
+    },
     "docs/tutorials/study.md": {
         "frames=90": "frames=40",
         "liex cohort study/study.toml --dry-run": f"{GROUPS}liex cohort study/study.toml --dry-run",

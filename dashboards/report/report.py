@@ -222,7 +222,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = (
     *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
     *("summary", "transitions", "activity", "hours", "rhythm", "zones", "events"),
-    *("crossings", "interactions", "interaction_totals"),
+    *("crossings", "interactions", "interaction_totals", "triggers"),
 )
 
 

@@ -18,7 +18,7 @@ al. 2019, Nature Biomedical Engineering 3:930) and deepof (Bordes et al. 2023, N
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, permutations
@@ -37,7 +37,7 @@ from liex_lab.body.shape import Surface
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.runtime.memory import blocks
-from liex_lab.tables.rows import frame_count, stop_times
+from liex_lab.tables.rows import Rows, frame_count, stop_times
 from liex_lab.tables.schema import INTERACTIONS, to_pandas
 from liex_lab.tracking.track import CORRECTED
 
@@ -98,8 +98,13 @@ class Interactions:
     limits: InteractionThresholds
     names: tuple[str, ...]
 
-    def for_session(self, session_id: str) -> dict[str, Any]:
-        """Tables, descriptions of their columns and notes, as `SessionWriter.close` takes them."""
+    def for_session(self, rows: Rows, measured: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+        """Tables, descriptions of their columns and notes, as `SessionWriter.close` takes them.
+
+        Args:
+            rows: the track of the session.
+            measured: its tables of behaviour, by name.
+        """
         tables = zip(TABLES, (self.events, self.totals), strict=True)
         about = {
             "individuals": list(self.names),
@@ -110,7 +115,7 @@ class Interactions:
             "results": {
                 name: to_pandas(
                     [column for column in INTERACTIONS if column.table == name],
-                    {"session_id": session_id, **table},
+                    {"session_id": rows.session_id, **table},
                 )
                 for name, table in tables
             },

@@ -328,29 +328,55 @@ def kinematics(
         The table: mm, s and rad in the arena frame, NaN if unknown.
     """
     joints = poses if isinstance(poses, Joints) else Joints.of_table(poses, len(frames))
-    body = BodyAxis.of(joints.names, joints.parents)
-    shape: dict[str, Array] = {}
-    for rows in blocks(joints.n_frames, _BLOCK):
-        _put(shape, rows, posture(body, *joints.at(rows)), joints.n_frames, allocate)
-    time_s = frames["time_s"].to_numpy(float)
-    observed = np.isfinite(shape["centre"][:, 0])
     begins = np.isin(frames["frame_index"].to_numpy(), seams)
-    before, after = neighbours(time_s, observed, half_window_s, begins)
-    span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
-    spans = Spans(before, after, span_s, slice(None))
+    limits = half_window_s, impossible_above_mm_s, surface_z_mm
+    measured = measures(joints, frames["time_s"].to_numpy(float), *limits, begins, allocate)
     block: dict[str, Any] = {}
     for name in ("frame_index", "time_s", "dt_s"):
         block[name] = allocate((len(frames),), frames[name].dtype)
         block[name][:] = frames[name].to_numpy()
     block |= {name: str(frames[name].iloc[0]) for name in ("session_id", "individual")}
+    kind = BodyAxis.of(joints.names, joints.parents).kind
+    return to_pandas(table_columns("kinematics", kind), block | measured, copy=False)
+
+
+def measures(
+    joints: Joints,
+    time_s: Array,
+    half_window_s: float = HALF_WINDOW_S,
+    impossible_above_mm_s: float = IMPOSSIBLE_MM_S,
+    surface_z_mm: float | None = None,
+    begins: NDArray[np.bool_] | None = None,
+    allocate: Allocator = np.empty,
+) -> dict[str, Array]:
+    """The measured columns of `kinematics`, (n,), by name, and further ones of `posture`.
+
+    Args:
+        joints: of n frames.
+        time_s: (n,) their times, s.
+        half_window_s: as for `kinematics`.
+        impossible_above_mm_s: as for `kinematics`.
+        surface_z_mm: as for `kinematics`.
+        begins: (n,) whether a frame begins a new stretch; None if none does.
+        allocate: makes the arrays.
+    """
+    body = BodyAxis.of(joints.names, joints.parents)
+    shape: dict[str, Array] = {}
+    for rows in blocks(joints.n_frames, _BLOCK):
+        _put(shape, rows, posture(body, *joints.at(rows)), joints.n_frames, allocate)
+    begins = np.zeros(len(time_s), np.bool_) if begins is None else begins
+    observed = np.isfinite(shape["centre"][:, 0])
+    before, after = neighbours(time_s, observed, half_window_s, begins)
+    span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
+    spans = Spans(before, after, span_s, slice(None))
     hold_s = stop_times(time_s) - time_s
-    block |= shape | _moving(shape, body.kind, spans, hold_s, impossible_above_mm_s, allocate)
+    found = shape | _moving(shape, body.kind, spans, hold_s, impossible_above_mm_s, allocate)
     if body.kind == SWIMS:
         number = segments(time_s, observed, begins)
         surface = np.nan if surface_z_mm is None else surface_z_mm
-        block |= tail_beat(shape, time_s, number, median_step(time_s))
-        block["below_surface_mm"] = surface - shape["centre"][:, 2]
-    return to_pandas(table_columns("kinematics", body.kind), block, copy=False)
+        found |= tail_beat(shape, time_s, number, median_step(time_s))
+        found["below_surface_mm"] = surface - shape["centre"][:, 2]
+    return found
 
 
 def _put(

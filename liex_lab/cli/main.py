@@ -41,6 +41,7 @@ from liex_lab.cli.options import (
     print_table,
     region_setting,
     to_json,
+    write_numbers,
 )
 from liex_lab.cli.sessions import (
     cohort,
@@ -328,7 +329,7 @@ def live(
         bool, typer.Option("--replay", help="Play back a finished recording at its own pace.")
     ] = False,
     to: Annotated[
-        str, typer.Option("--to", help="viewer, the address of a viewer, or an .rrd file.")
+        str, typer.Option("--to", help="viewer, none, the address of a viewer, or an .rrd file.")
     ] = "viewer",
     patience_s: Annotated[
         float,
@@ -336,15 +337,70 @@ def live(
             "--patience-s", min=0.1, help="Stop after this many seconds without a new frame."
         ),
     ] = 3.0,
+    rules: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--trigger",
+            metavar="RULE",
+            help="An action, in ZONE, or a condition on columns, as "
+            '"speed_mm_s > 200 until speed_mm_s < 150"; repeatable.',
+        ),
+    ] = None,
+    send: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--send",
+            metavar="ADDRESS",
+            help="Receiver of triggers: udp://HOST:PORT, zmq://HOST:PORT, lsl://NAME or "
+            "serial:///dev/NAME; repeatable.",
+        ),
+    ] = None,
+    for_s: Annotated[
+        float | None,
+        typer.Option(
+            "--for-s",
+            min=0.0,
+            help="Trigger after the rule held so long, s; default: 0.1 for actions, else 0.",
+        ),
+    ] = None,
+    refractory_s: Annotated[
+        float,
+        typer.Option("--refractory-s", min=0.0, help="Least time between two triggers, s."),
+    ] = 0.0,
+    probability: Annotated[
+        float,
+        typer.Option(
+            "--probability", min=0.0, max=1.0, help="Share of triggers that are sent, at random."
+        ),
+    ] = 1.0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", metavar="DIR", help="Make a session here when the recording is over."
+        ),
+    ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Show skeletons in Rerun during a recording, and measure their latency."""
+    """Show skeletons in Rerun during a recording, trigger on rules, and measure the latency."""
     chosen = load_plan(plan, settings or [])
+    if send and not rules:
+        raise LiexError("--send names a receiver, but no rule: state one with --trigger")
+    triggers = api.Triggers(tuple(rules or ()), tuple(send or ()), for_s, refractory_s, probability)
     with progress_bar() as progress:
         result = api.follow_live(
-            source, chosen, replay=replay, to=to, patience_s=patience_s, progress=progress
+            source,
+            chosen,
+            replay=replay,
+            to=to,
+            patience_s=patience_s,
+            triggers=triggers if rules else None,
+            out=out,
+            progress=progress,
         )
-    print_numbers(result, json_file)
+    about, failed = result.pop("triggers", []), result.pop("failed_receivers", {})
+    print_numbers(result)
+    if json_file is not None:
+        write_numbers({**result, "triggers": about, "failed_receivers": failed}, json_file)
     if not result["n_live"]:
         echo(
             "no latency: frames that came while background, floor and size were learned were still "
@@ -352,6 +408,28 @@ def live(
         )
     if to.endswith(".rrd"):
         echo(f"replay: {to}; Rerun's viewer opens it: rerun {to}")
+    for address, why in failed.items():
+        echo(f"{address} did not take every message: {why}")
+    for one in about:
+        echo(_trigger_sentence(one))
+
+
+def _trigger_sentence(about: dict[str, Any]) -> str:
+    """What became of the events of one rule."""
+    counts = (f"{about[f'n_{one}']} {one}" for one in ("sent", "withheld", "late", "failed"))
+    text = f"trigger '{about['rule']}': {about['n_events']} events ({', '.join(counts)})"
+    if about["latency_p95_ms"] is not None:
+        text += f", 95 % sent within {about['latency_p95_ms']:.1f} ms of their frame"
+    if "n_session" not in about:
+        return f"{text}; --out compares them with the finished session"
+    shares = (
+        f"{name} {'–' if about[name] is None else format(about[name], '.2f')}"
+        for name in ("precision", "recall")
+    )
+    return (
+        f"{text}; the finished session has {about['n_session']}: {', '.join(shares)} "
+        f"(within {about['tolerance_s']:g} s)"
+    )
 
 
 @app.command(rich_help_panel=MODELS)

@@ -576,12 +576,25 @@ def evaluate_live(
     n_cameras: Annotated[
         int, typer.Option("--cameras", min=1, max=16, help="Number of simultaneous cameras.")
     ] = 1,
+    rules: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--trigger",
+            metavar="RULE",
+            help="Also measure a trigger of one camera, see `liex live`; repeatable.",
+        ),
+    ] = None,
     *,
     progress: Progress,
 ) -> Result:
     """Measure the latency of live tracking of a virtual animal."""
     return api.evaluate_live(
-        animal, n_frames=n_frames, rate_hz=rate_hz, n_cameras=n_cameras, progress=progress
+        animal,
+        n_frames=n_frames,
+        rate_hz=rate_hz,
+        n_cameras=n_cameras,
+        rules=rules or (),
+        progress=progress,
     )
 
 

@@ -60,6 +60,7 @@ FILES = {  # of a session, and whether every version writes it
     "zones.parquet": False,
     "interactions.parquet": False,
     "interaction_totals.parquet": False,
+    "triggers.parquet": False,
     "columns.json": True,
     "session.rrd": True,
     "session.mcap": True,

@@ -148,6 +148,7 @@ CROSSINGS = table_columns("crossings")
 INTERACTIONS = table_columns("interactions") + table_columns("interaction_totals")
 EVENTS = table_columns("events")  # of another instrument
 DAYS = table_columns("hours") + table_columns("rhythm")  # of sessions with [light] in the plan
+TRIGGERS = table_columns("triggers")  # of a live recording
 POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
@@ -160,7 +161,7 @@ def all_columns() -> dict[str, Column]:
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
     tables = chain(
-        *TABLES.values(), *SYNCED.values(), CROSSINGS, INTERACTIONS, EVENTS, DAYS, POINTS
+        *TABLES.values(), *SYNCED.values(), CROSSINGS, INTERACTIONS, EVENTS, DAYS, TRIGGERS, POINTS
     )
     every = chain(tables, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}

@@ -361,6 +361,10 @@ class OnlineTracker:
     The hypothesis chosen for a frame does not change once its row is returned; estimates improve
     with a longer lag. With lag 0 a row is returned at once, from the past alone.
 
+    Attributes:
+        recent: the row returned last and up to 20 before it, smoothed together: rates within it are
+            those of one curve.
+
     Args:
         subject: the animal.
         lag: frames by which a row is delayed.
@@ -383,6 +387,7 @@ class OnlineTracker:
         self._path: NDArray[np.int64] = np.zeros(0, np.int64)
         self._n_returned = 0  # of the window's frames
         self._monitor = OcclusionMonitor()
+        self.recent = Track.empty(subject.skeleton, np.zeros(0, np.int64))
 
     def add(self, observed: Observations) -> Track | None:
         """Add frames; returns the rows that are due.
@@ -427,8 +432,7 @@ class OnlineTracker:
         measured = observed.seconds, observed.pose(path), observed.along(observed.error_mm, path)
         curve = smooth(subject.skeleton, *measured, subject.length_mm, self._motion)
         usual_px = self._monitor.usual_px
-        track = to_track(
-            subject, observed, path, curve, doubt, ahead=True, due=due, usual_px=usual_px
-        )
+        self.recent = to_track(subject, observed, path, curve, doubt, ahead=True, usual_px=usual_px)
+        track = self.recent[due]
         hide(track, self._monitor.gone(observed[due], path[due], track.observed))
         return track

@@ -1,19 +1,13 @@
-"""Speed of pose estimation and of live tracking, and the timers of all benchmarks.
+"""Speed of pose estimation, and the timers of all benchmarks.
 
 `liex evaluate speed` times rendered frames of the split `clean`, in memory, from foreground to
 final pose (Lie-X Table 3), the best of 5 repeats after one that compiles: frames/s of the default
 on one and on two cores, the ratio to the paper's variant on our engine, to Algorithm 1 as
 published, and to the baselines that were trained on this machine; and ms per frame on one core by
 stage, and by number of joints, of candidates and of pixels.
-
-`liex evaluate live` renders up to 150 frames of a moving virtual animal, keeps them in memory and
-sends them through a local socket at the camera's pace, forwards and backwards: median and 95 %
-latency, ms, of all frames since the first one that arrived after its predecessors were processed,
-which excludes learning the background.
 """
 
 import json
-import multiprocessing
 import os
 import platform
 import shutil
@@ -24,13 +18,11 @@ import time
 import timeit
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from threading import Barrier
 from typing import Any, cast
 
 import numba
@@ -44,7 +36,7 @@ from liex_lab.estimation.cascade import Candidates, ImageSet, draw_starts, start
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
-from liex_lab.recordings import open_recording, streaming
+from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.writer import ImageFolderWriter, McapDepthWriter, RecordingWriter
@@ -58,7 +50,6 @@ from liex_lab.simulation.simulator import open_synthetic, world_of
 
 from ..build import build_scene, plan_of
 from ..convert import convert
-from ..live import track_live
 from ..training.pose_model import (
     BASELINES,
     cached_baseline,
@@ -78,14 +69,6 @@ _PROTOCOL = (
 )
 
 
-LIVE_PROTOCOL = (
-    "Frames are rendered beforehand, kept in memory, and sent through a socket of this machine at "
-    "the camera's pace, forwards and backwards in turn. latency: from when a whole frame had come "
-    "to when its skeleton was reported, without a viewer; counted from the first frame on that "
-    "came when all before it had been reported, so that learning the background is not in it, and "
-    "from then on every frame. Some frames are followed beforehand, so that all is compiled."
-)
-_SEED = 78_001
 FPS = 30
 STEP_NS = int(1e9 / FPS)
 _CHILD = """
@@ -333,92 +316,6 @@ def _stages_and_costs(
         "pixels": {one.pixels: ms(one.scene.extract, one.frames, size, False) for one in sizes},
     }
     return stages, costs
-
-
-def evaluate_live(
-    animal: str = "fish",
-    *,
-    n_frames: int = 1500,
-    learn_frames: int = 90,
-    rate_hz: float | None = None,
-    n_cameras: int = 1,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Latencies of live tracking over n frames; `liex evaluate live`.
-
-    Args:
-        animal: a bundled animal's name, or the path of a skeleton's TOML.
-        n_frames: frames that each camera sends.
-        learn_frames: frames that background, floor and size are learned from.
-        rate_hz: frames per second that are sent; None means the camera's own rate.
-        n_cameras: number of simultaneous cameras, each in a separate process.
-        progress: called with the progress of rendering and tracking, if there is one camera.
-
-    Returns:
-        `rate_hz`, the numbers of `track_live`, and the protocol; of several cameras the largest
-        latencies, and in `cameras` the numbers of each.
-    """
-    film = partial(_film, animal, n_frames, learn_frames, rate_hz)
-    if n_cameras == 1:
-        return {**film(_SEED, progress=progress), "protocol": LIVE_PROTOCOL}
-    progress(0, None, f"filming with {n_cameras} cameras at once")
-    spawn = multiprocessing.get_context("spawn")
-    with spawn.Manager() as manager, ProcessPoolExecutor(n_cameras, spawn) as pool:
-        cameras = list(
-            pool.map(
-                partial(film, ready=manager.Barrier(n_cameras)), range(_SEED, _SEED + n_cameras)
-            )
-        )
-    numbers = {
-        name: [one[name] for one in cameras]
-        for name in ("latency_median_ms", "latency_p95_ms", "n_frames", "n_live", "n_measured")
-    }
-    latest = {
-        name: max((one for one in numbers[name] if one is not None), default=None)
-        for name in ("latency_median_ms", "latency_p95_ms")
-    }
-    return {
-        "animal": animal,
-        "rate_hz": cameras[0]["rate_hz"],
-        **latest,
-        "cameras": numbers,
-        "protocol": LIVE_PROTOCOL,
-    }
-
-
-def _film(
-    animal: str,
-    n_frames: int,
-    learn_frames: int,
-    rate_hz: float | None,
-    seed: int,
-    ready: Barrier | None = None,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """The numbers of one camera, which starts when all cameras are ready."""
-    try:
-        # frames rendered
-        filmed = world_of(Skeleton.load(animal)).motion(seed, min(150, n_frames))
-        progress(0, None, "rendering frames")
-        step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
-        arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
-        plan = plan_of(animal)
-        # 60 frames tracked beforehand, a thousand times as fast
-        track_live(
-            streaming.replayed(arriving[: learn_frames + 60], 1000.0),
-            plan,
-            learn_frames=learn_frames,
-        )
-        if ready is not None:
-            ready.wait()
-    except BaseException:
-        if ready is not None:
-            ready.abort()  # the others would wait forever
-        raise
-    numbers, _ = track_live(
-        streaming.replayed(arriving), plan, learn_frames=learn_frames, progress=progress
-    )
-    return {"animal": animal, "rate_hz": 1e9 / step_ns, **numbers}
 
 
 def looped(

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from liex_lab.pipelines.evaluation.speed import evaluate_live
+from liex_lab.pipelines.evaluation.live import evaluate_live
 from liex_lab.pipelines.live import open_live, track_live
 
 from liex_lab.errors import RecordingError
