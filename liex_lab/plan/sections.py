@@ -157,7 +157,7 @@ class Circle(SettingsTable):
 
 
 class Rfid(SettingsTable):
-    """RFID readings that distinguish the animals of one arena apart."""
+    """RFID readings that identify the animals of one arena."""
 
     readings: str = Field(
         description=(
@@ -198,7 +198,7 @@ class AnimalSettings(SettingsTable):
     rfid: Rfid | None = Field(
         None,
         description=(
-            "RFID readings that distinguish several animals: {readings = 'FILE.csv', tags = [...], "
+            "RFID readings that identify several animals: {readings = 'FILE.csv', tags = [...], "
             "antennas = {NAME = {centre = [x, y], radius = r}}}; see docs/howto/rfid.md"
         ),
     )

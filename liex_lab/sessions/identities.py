@@ -21,7 +21,7 @@ from liex_lab.runtime.text_files import loose_json
 from liex_lab.sessions import evidence
 from liex_lab.sessions.corrections import LogEntry, Roles, read_log
 from liex_lab.sessions.session import Session
-from liex_lab.tables.rows import frame_count, rows_between
+from liex_lab.tables.rows import ROUNDED_S, frame_count, rows_between
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.identity import flag_unclear
 from liex_lab.tracking.observations import COLUMNS, Observations
@@ -134,7 +134,7 @@ def check_crossing(session: Session, at_s: float) -> Roles:
     """
     members = arena_sessions(session)
     table = session.crossings
-    inside = table[(table["start_s"] <= at_s) & (at_s <= table["stop_s"])]
+    inside = table[(table["start_s"] - ROUNDED_S <= at_s) & (at_s <= table["stop_s"])]
     if not len(inside):
         begin = ", ".join(f"{one:.3f}" for one in table["start_s"][:10]) or "none"
         raise SessionError(
@@ -216,9 +216,9 @@ def exchanged(
 def _reviewed(
     crossing: Crossing, order: Slots, entries: Sequence[LogEntry], index: Slots
 ) -> Crossing:
-    """A crossing by the corrected names of its animals, and its last reviewer.
+    """A crossing by the corrected names of its animals, and the person who reviewed it last.
 
-    The author of an exchange in it, or up to its end, has reviewed it.
+    Exchanging animals in it, or at its end, is a review.
     """
     some = np.isin(order[crossing.start : crossing.stop], crossing.animals).any(axis=0)
     crossing = replace(crossing, animals=tuple(np.flatnonzero(some).tolist()))
@@ -228,10 +228,10 @@ def _reviewed(
         assert isinstance(one.what, Roles)
         ends = (one.what.start_frame, one.what.stop_frame)
         inner = {*ends} - {int(count[0]), int(count[-1])}
-        covers = (
+        applies = (
             any(span[0] <= end <= span[1] for end in inner) if one.what.animals else ends == span
         )
-        if covers:
+        if applies:
             crossing = replace(
                 crossing,
                 p_swap=0.0,
