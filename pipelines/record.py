@@ -1,8 +1,8 @@
 """`liex record`: the frames of a depth camera as an MCAP file, with calibration and its own times.
 
 A thread reads the camera, another writes, so that a slow disk delays no frame before 128 of them
-wait. The file is complete when it ends, whatever ends it; one that was cut off, by a full disk or
-the power, keeps all frames but the last one.
+wait. The file is complete when it ends by itself, by Ctrl-C or with the camera's cable; one that
+was cut off, by a full disk or the power, keeps all but its last frame, or 128 kB of small frames.
 """
 
 from __future__ import annotations
