@@ -80,6 +80,7 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "train_tracking": "training.motion_model",
     "convert": "convert",
     "pack": "convert",
+    "record": "record",
     "examine": "doctor",
     "print_report": "doctor",
     "whole_images": "drawing",

@@ -100,7 +100,8 @@ def open_anyhow(
             missing.append(
                 f"the images have no timestamps, and {_USUAL_HZ:g} frames/s were assumed "
                 f"here; write fps = {_USUAL_HZ:g} (your camera's rate) under [camera] in "
-                "camera.toml, or timestamps.csv with a line time_ns and then one time per image"
+                "camera.toml, or timestamps.csv with a line time_ns and then one time per image; "
+                "cameras differ from the rate on their label (Femto Bolt 30.03 to 30.14 frames/s)"
             )
             guessed = guessed.with_settings([f"recording.fps={_USUAL_HZ}"])
         except SeveralKindsError as error:
@@ -134,7 +135,7 @@ def _guess_camera(recording: Recording) -> str:
         f"the camera is not known, so all lengths here are guesses with {like}; {choice}write "
         f"camera.toml with the lines [camera], fx = {focal:g}, fy = {focal:g}, cx = {cx:g}, "
         f"cy = {cy:g} (your camera's numbers, in pixels) and unit_mm = 1.0 (millimetres per stored "
-        "step)"
+        "step); `liex record` stores the calibration in the camera with the recording"
     )
 
 
@@ -248,6 +249,7 @@ def examine(
             *_time_problems(opened),
             *_repeated_images(opened, sample),
             *unlikely,
+            *_preset_problems(plan.camera.preset, lens, median_mm, facts.get("scene")),
             *misplaced,
             *scene,
             *proposal.problems,
@@ -306,6 +308,44 @@ def _repeated_images(recording: Recording, sample: NDArray[np.float32]) -> list[
     return [f"{sentence}{some}" for part in found for sentence in part]
 
 
+def _preset_problems(
+    name: str | None, lens: camera.Camera, median_mm: float | None, scene: dict[str, Any] | None
+) -> list[str]:
+    """Depths that the named camera does not deliver: in another unit, or cut to coarser steps."""
+    size = (lens.width, lens.height)
+    fitting = [
+        mode
+        for mode in camera.DEPTH_MODES
+        if mode.name == name and (mode.camera.width, mode.camera.height) == size
+    ]
+    problems = []
+    for mode in fitting if median_mm is not None else []:
+        near, far = mode.range_mm or (0.0, math.inf)
+        if not near / 2 <= median_mm <= 3 * far:
+            problems.append(
+                f"the median depth is {median_mm:.0f} mm, but a {name} reads {near:g} to {far:g} "
+                f"mm, in steps of {mode.unit_mm:g} mm; the recorder wrote another unit, so state "
+                "the true unit_mm (millimetres per stored step) in camera.toml"
+            )
+        step = ((scene or {}).get("sensor") or {}).get("step_mm")
+        if step is not None and step > 3 * mode.unit_mm:
+            problems.append(
+                f"depth is in steps of {step:.2g} mm, but a {name} delivers {mode.unit_mm:g} mm: "
+                "the recorder cut its depth to coarser steps, which puts it too near by up to one "
+                "of them; keep the camera's own steps, as `liex record` does"
+            )
+    return problems
+
+
+_LABELS_HZ: Final = (5, 6, 15, 25, 30, 60, 90)
+
+
+def _label_hz(rate_hz: float) -> int | None:
+    """The rate on a camera's label that its true rate differs from by 0.03 to 1 per cent."""
+    near = min(_LABELS_HZ, key=lambda hz: abs(hz - rate_hz))
+    return near if 3e-4 < abs(rate_hz / near - 1.0) < 1e-2 else None
+
+
 def _time_facts(recording: Recording) -> dict[str, Any]:
     step = np.diff(recording.times_ns) / 1e6
     dropped = _dropped(recording)
@@ -317,6 +357,7 @@ def _time_facts(recording: Recording) -> dict[str, Any]:
         "n_frames": len(recording),
         "duration_s": _finite(recording.duration_s),
         "rate_hz": _finite(recording.rate_hz),
+        "label_hz": _label_hz(recording.rate_hz),
         "jitter_ms": float(usual.std()) if len(usual) > 1 else None,
         "n_gaps": len(dropped),
         "n_missing": sum(gap.n_frames_missing for gap in dropped),

@@ -679,7 +679,7 @@ def conclude(
         closing["results"] |= more["results"]
         closing["columns"] += more["columns"]
         closing["record"] |= more["record"]
-        closing["together"] = together
+        closing["together"] = more.get("together")
     return writer.close(timings_s=timings, **closing)
 
 

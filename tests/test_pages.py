@@ -42,6 +42,7 @@ SKIPPED = {
     r"^\.venv/bin/pip install": "installs packages, which .ci/run does",
     r"^(?:\S*/)?liex show ": "opens a window",
     r"^liex dashboard ": "serves pages until it is stopped",
+    r"^liex record ": "needs a camera; pipelines/test_record.py does it without",
     r"^dandi ": "another program, which .ci/peers runs",
     r"^liex evaluate actions --tracks": "needs real mice with people's words",
     r"ANIMAL1|^liex correct crossing ": "needs two animals; sessions/test_identities.py does it",

@@ -55,7 +55,7 @@ from liex_lab.cli.sessions import (
     show,
     verify,
 )
-from liex_lab.errors import LiexError, MisfitError, printable
+from liex_lab.errors import LiexError, MisfitError, RecordingError, printable
 from liex_lab.runtime import durable, memory, processes
 from liex_lab.runtime.progress import progress_bar
 
@@ -430,6 +430,36 @@ def _trigger_sentence(about: dict[str, Any]) -> str:
         f"{text}; the finished session has {about['n_session']}: {', '.join(shares)} "
         f"(within {about['tolerance_s']:g} s)"
     )
+
+
+@app.command(rich_help_panel=RECORDINGS)
+def record(
+    camera: Annotated[str, typer.Option("--camera", metavar="MAKER", help="orbbec or realsense.")],
+    out: Annotated[Path, typer.Option("--out", metavar="NAME.mcap", help="The recording.")],
+    seconds: Annotated[
+        float | None,
+        typer.Option("--seconds", min=0.1, help="Its length; default: until Ctrl-C."),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(
+            "--preset",
+            metavar="NAME",
+            help="Ask for the image size of this camera, such as femto-bolt or d435:640x480.",
+        ),
+    ] = None,
+) -> None:
+    """Record a depth camera as MCAP, with its calibration, its own times and counted drops."""
+    with progress_bar() as progress:
+        done = api.record(camera, out, seconds=seconds, preset=preset, progress=progress)
+    echo(
+        f"recording: {done.path} ({done.n_frames} frames in {done.duration_s:.1f} s, "
+        f"{done.n_dropped} dropped)"
+    )
+    for sentence in done.notes:
+        echo(f"note: {sentence}")
+    if done.error:
+        raise RecordingError(done.error)
 
 
 @app.command(rich_help_panel=MODELS)

@@ -222,7 +222,7 @@ _OF_WORK = (
     *("demo", "doctor", "run", "show"),
     *("report", "figures", "correct", "describe", "suggest", "export", "verify"),
     *("cohort", "compare", "dashboard"),
-    *("import", "convert", "pack", "live"),
+    *("record", "import", "convert", "pack", "live"),
     *("info", "train", "evaluate"),
 )
 

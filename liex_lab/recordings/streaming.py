@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from queue import Queue
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,9 @@ _HEAD = struct.Struct("<I")  # length of the greeting, JSON
 _POLL_S = 0.02
 _GREETING_S = 10.0  # for the whole greeting
 _FRAME_S = 30.0  # for the rest of a frame that has begun
+
+
+_Frame = TypeVar("_Frame")
 
 
 class Arrival(NamedTuple):
@@ -155,7 +158,7 @@ def received(host: str, port: int) -> Arriving:
     with closing_on_error(link):
         name, camera = _greeting(link, where)
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    return Arriving(name, camera, _stamped(_frames(link, camera, where)))
+    return Arriving(name, camera, read_ahead(_frames(link, camera, where)))
 
 
 def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
@@ -181,13 +184,16 @@ def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
     )
 
 
-def _stamped(frames: Iterator[Arrival]) -> Iterator[Arrival]:
-    """The same frames, read on a separate thread.
+def read_ahead(frames: Iterator[_Frame]) -> Iterator[_Frame]:
+    """The same frames, read on a separate thread, at most 128 ahead.
 
     The time of a frame is then its arrival, not its request.
+
+    Args:
+        frames: in order; a RecordingError ends them.
     """
     # frames buffered; then the sender waits
-    waiting: Queue[Arrival | RecordingError | None] = Queue(128)
+    waiting: Queue[_Frame | RecordingError | None] = Queue(128)
 
     def fetch() -> None:
         try:

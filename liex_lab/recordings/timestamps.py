@@ -506,9 +506,17 @@ def match_counts(n_frames: int, n_stamps: int, frames_from: str, times_from: str
     """
     if n_frames == n_stamps:
         return []
+    more = n_stamps - n_frames
+    cause = (
+        f"; recorders that wait for the infrared image, such as orbbec-acquire, drop the depth "
+        f"image without one and keep its stamp, so times may be early by up to {more} frames: "
+        "record depth alone, or with `liex record`"
+        if more > 0
+        else ""
+    )
     return [
         f"{frames_from} holds {n_frames} frames but {times_from} holds {n_stamps} time "
-        f"stamps; the first {min(n_frames, n_stamps)} of both are used"
+        f"stamps; the first {min(n_frames, n_stamps)} of both are used{cause}"
     ]
 
 

@@ -14,6 +14,7 @@ from liex_lab.pipelines.build import open_planned
 from liex_lab.pipelines.choice import PlanFit, Proposal, propose_plan
 from liex_lab.pipelines.doctor import (
     FINDINGS,
+    _preset_problems,
     examine,
     lines,
     next_command,
@@ -57,6 +58,7 @@ KEYS = [
     "n_frames",
     "duration_s",
     "rate_hz",
+    "label_hz",
     "jitter_ms",
     "n_gaps",
     "n_missing",
@@ -638,3 +640,44 @@ def test_a_principal_point_far_from_the_middle_is_reported(
 ) -> None:
     sentence, edge = unusual_centre(Camera(287.9, 287.9, cx, cy, 320, 240))
     assert (f"({cx:.1f}, {cy:.1f})" in sentence, edge) == (said, at_edge)
+
+
+# faults of known recorders
+
+
+def test_a_rate_that_is_not_the_one_on_the_label_is_told(tmp_path: Path) -> None:
+    for hz, label in ((30.14, 30), (30.0, None), (29.0, None)):
+        stamps = [round(k * 1e9 / hz) for k in range(12)]
+        found = examine(write_png_folder(tmp_path / f"{hz}", frames(), CAMERA, stamps))
+        assert found["label_hz"] == label
+        rate = dict(lines(found))["rate"]
+        assert ("off by 16.8 s in an hour" in rate) == (label == 30)
+
+
+def test_stamps_of_dropped_images_are_explained(tmp_path: Path) -> None:
+    stamps = [f"{1000.0 + k * 33.3333:.4f}" for k in range(15)]
+    folder = write_moseq_folder(
+        tmp_path / "session", depth_frames(12, 512, 424, floor_mm=700), stamps
+    )
+    said = problems(folder)
+    assert "12 frames but depth_ts.txt holds 15" in said
+    assert "without one and keep its stamp, so times may be early by up to 3 frames" in said
+
+
+@pytest.mark.parametrize(
+    ("median_mm", "step_mm", "said"),
+    [
+        (420.0, 0.1, ""),
+        (4200.0, 0.1, "reads 70 to 500 mm, in steps of 0.1 mm; the recorder wrote another unit"),
+        (420.0, 1.0, "in steps of 1 mm, but a d405 delivers 0.1 mm"),
+    ],
+)
+def test_depth_that_the_named_camera_does_not_deliver_is_told(
+    median_mm: float, step_mm: float, said: str
+) -> None:
+    scene = {"sensor": {"step_mm": step_mm}}
+    (camera, _) = PRESETS["d405"]
+    found = _preset_problems("d405", camera, median_mm, scene)
+    assert len(found) == bool(said)
+    assert said in " | ".join(found)
+    assert not _preset_problems(None, camera, median_mm, scene)
