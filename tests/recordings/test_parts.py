@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from liex_lab.pipelines.study.status import input_stamp
 
+from liex_lab.cli.options import as_one
 from liex_lab.errors import RecordingError
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.timestamps import DROPPED, JUMPED
@@ -116,3 +118,26 @@ def test_a_part_that_changed_after_the_recording_was_opened_is_not_read(tmp_path
         (tmp_path / "cam1_1.mcap").write_bytes((tmp_path / "cam1_2.mcap").read_bytes())
         with pytest.raises(RecordingError, match="changed while it was measured"):
             parts.frame(3)
+
+
+def test_files_on_the_command_line_are_one_recording(tmp_path: Path) -> None:
+    write_mcap_parts(tmp_path, FRAMES)
+    files = sorted(tmp_path.iterdir())
+    assert as_one(files[:1]) == files[0]
+    with open_recording(as_one(files)) as parts:
+        assert (parts.name, len(parts), parts.sources) == ("cam1", N, tuple(files))
+    with pytest.raises(RecordingError, match="expected in one folder"):
+        as_one([files[0], tmp_path / "other" / "cam1_1.mcap"])
+
+
+def test_a_study_knows_when_one_of_the_files_changed_or_is_gone(tmp_path: Path) -> None:
+    write_mcap_parts(tmp_path, FRAMES)
+    pattern = str(tmp_path / "cam1_*.mcap")
+    stamps = [input_stamp(pattern)]
+    cut(tmp_path / "cam1_1.mcap", 0.6)
+    stamps.append(input_stamp(pattern))
+    (tmp_path / "cam1_1.mcap").unlink()
+    stamps.append(input_stamp(pattern))
+    assert len({*stamps}) == 3
+    assert input_stamp(str(tmp_path / "cam2_*.mcap")) == ""
+    assert input_stamp(str(tmp_path / "{cam1_0.mcap,cam1_1.mcap}")) == ""
