@@ -161,7 +161,8 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="nwb, boris, dlc (or deeplabcut), movement, sleap, points, csv, xlsx or video.",
+            help="nwb, boris, dlc (or deeplabcut), movement, sleap, points, moseq, csv, xlsx "
+            "or video.",
         ),
     ],
     out: Annotated[

@@ -63,6 +63,11 @@ TARGETS: dict[str, tuple[str, str, str]] = {
         "_points",
         "a folder with points on the skin, derived from the fitted body, and the tail's direction",
     ),
+    "moseq": (
+        "moseq.write_scalars",
+        "_scalars_moseq.csv",
+        "MoSeq's scalars by its definitions, in its own and in true millimetres, as CSV",
+    ),
     "csv": (
         "export.write_csv_folder",
         "_csv",
