@@ -319,9 +319,9 @@ def _preset_problems(
         if mode.name == name and (mode.camera.width, mode.camera.height) == size
     ]
     problems = []
-    for mode in fitting if median_mm is not None else []:
+    for mode in fitting:
         near, far = mode.range_mm or (0.0, math.inf)
-        if not near / 2 <= median_mm <= 3 * far:
+        if median_mm is not None and not near / 2 <= median_mm <= 3 * far:
             problems.append(
                 f"the median depth is {median_mm:.0f} mm, but a {name} reads {near:g} to {far:g} "
                 f"mm, in steps of {mode.unit_mm:g} mm; the recorder wrote another unit, so state "

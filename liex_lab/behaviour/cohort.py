@@ -259,7 +259,7 @@ def _compare_one(
 
 
 def _check_together(rows: pd.DataFrame, measure: str, units: Units) -> None:
-    """Refuse what a comparison cannot say of the animals of one arena.
+    """Refuse what a comparison cannot state about the animals of one arena.
 
     Raises:
         NotComparable: they may have been exchanged, or a measure of the arena is compared between

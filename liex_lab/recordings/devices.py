@@ -197,7 +197,7 @@ def open_orbbec(mode: DepthMode | None = None) -> Device:
             f"{width} x {height}; update its firmware and pyorbbecsdk2"
         )
     model = str(bent.model).rpartition(".")[2].removesuffix("_K6").removesuffix("4")
-    keys = ("k1", "k2", "k3", "k4")
+    keys: tuple[str, ...] = ("k1", "k2", "k3", "k4")
     if model != "KANNALA_BRANDT":
         keys = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     camera = Camera(

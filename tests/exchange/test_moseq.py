@@ -62,7 +62,8 @@ def test_a_real_study_measured_again_agrees_with_its_frames_and_with_moseq(
 ) -> None:
     home = reference_data / "mouse_kinect2"
     truth = pd.read_csv(home / "reference.csv")[13:133]  # all of them reliable
-    background = cv2.imread(str(home / "background.png"), cv2.IMREAD_UNCHANGED).astype(float)
+    image = cv2.imread(str(home / "background.png"), cv2.IMREAD_UNCHANGED)
+    background = np.asarray(image, float)
     roi = np.zeros(background.shape, np.bool_)
     roi[99:351, 115:370] = True  # the box of MoSeq's region
     places = truth[["centroid_x_px", "centroid_y_px", "angle_rad"]].to_numpy() - (115, 99, 0)

@@ -73,7 +73,7 @@ def test_a_camera_without_a_clock_is_told(plug_in: Any, tmp_path: Path) -> None:
 def test_ctrl_c_ends_the_file_properly(
     plug_in: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Interrupted(jobs.threading.Thread):  # type: ignore[name-defined, misc]
+    class Interrupted(jobs.threading.Thread):
         waited = 0
 
         def join(self, timeout: float | None = None) -> None:

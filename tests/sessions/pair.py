@@ -36,10 +36,10 @@ def write_pair(folder: Path, seconds: float = 3.0, group: str = "", **more: Any)
             writer.track = track
             measured = behaviour.measure_rows(writer.rows, None, behaviour.Surroundings())
             closing = measured.for_session()
-            own = together.for_session(writer.origin.name)
+            own = together.for_session(writer.rows, measured.tables)
             closing["results"] |= own["results"]
             closing["columns"] = [*closing["columns"], *own["columns"]]
             closing["record"] = {**closing.get("record", {}), **own["record"]}
-            closing["together"] = together
+            closing["together"] = own["together"]
             sessions.append(writer.close(**closing))
     return sessions
