@@ -8,15 +8,24 @@ constant per joint, and in depth with the middle between upper and lower skin.
 """
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from liex_lab.body.skeleton import Array, Skeleton
 from liex_lab.errors import LiexError, refuse
-from liex_lab.evaluation.scores import FAR, MeasuredIndividual, along_body, interval95, is_flipped
+from liex_lab.evaluation.scores import (
+    FAR,
+    MeasuredIndividual,
+    along_body,
+    error_of,
+    interval95,
+    is_flipped,
+)
 from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.recording import Recording
@@ -44,11 +53,13 @@ FOREIGN_PROTOCOL = (
     "joint coordinates within 1.645 sd (sd_xy_mm, sd_z_mm) in the arena. expected_over_true: "
     "median of predicted_error_mm over error_mm. trusted: share of all frames without a flag. "
     "trusted_and_wrong: of those, the share whose error is beyond 10 mm (mouse) or 15 % of the "
-    "length (others). found: share of frames with a pose. summary: median over bodies, and with 95 "
-    "its 95 % interval, bodies drawn with replacement."
+    "length (others). found: share of frames with a pose. Of several animals in a recording, which "
+    "are measured with animal.count, each is a row; individuals are assigned by their median "
+    "distance, and exchanged is the share of frames nearer to another true animal. summary: median "
+    "over bodies, and with 95 its 95 % interval, bodies drawn with replacement."
 )
 _NO_RECORDINGS = (".npz", ".liex", ".json", ".toml", ".csv", ".md", ".txt")
-Foreign = tuple[Recording, TrueAnimal]  # with joints as of `truth_of`
+Foreign = tuple[Recording, dict[str, TrueAnimal]]  # by letter; joints as of `truth_of`
 
 
 def evaluate_foreign(
@@ -106,17 +117,21 @@ def evaluate_foreign(
         else given_cases(Path(truth), plan, shares)
     )
     rows: dict[str, dict[str, Any]] = {}
-    for k, (recording, body) in enumerate(cases):
+    for k, (recording, bodies) in enumerate(cases):
         progress(k, len(cases), f"measuring {recording.name}")
         with recording:
-            individuals, messages, exit_code = run_product(recording, plan)
-        one = max(individuals, key=lambda one: int(one.trusted.sum()), default=None)
-        skipped += [] if one else [f"{recording.name}: {'; '.join(messages)}"]
-        rows[recording.name] = {
-            **(body_figures(body, one, skeleton) if one else {"found": 0.0, "trusted": 0.0}),
-            "said": messages,
-            "exit_code": exit_code,
-        }
+            count = [f"animal.count={len(bodies)}"] if len(bodies) > 1 else []
+            individuals, messages, exit_code = run_product(recording, plan.with_settings(count))
+        skipped += [] if individuals else [f"{recording.name}: {'; '.join(messages)}"]
+        found = _assigned([*bodies.values()], individuals)
+        for number, (letter, body) in enumerate(bodies.items()):
+            own: dict[str, Any] = {"found": 0.0, "trusted": 0.0}
+            if number in found:
+                one, exchanged = found[number]
+                own = body_figures(body, one, skeleton)
+                own |= {"exchanged": exchanged} if len(bodies) > 1 else {}
+            name = f"{recording.name} {letter}".rstrip()
+            rows[name] = {**own, "said": messages, "exit_code": exit_code}
     summary: dict[str, Any] = {"n_bodies": len(rows)}
     for name in dict.fromkeys(k for row in rows.values() for k in row if isinstance(row[k], float)):
         values = np.array([row.get(name, np.nan) for row in rows.values()])
@@ -133,6 +148,23 @@ def evaluate_foreign(
     }
 
 
+def _assigned(
+    bodies: Sequence[TrueAnimal], individuals: Sequence[MeasuredIndividual]
+) -> dict[int, tuple[MeasuredIndividual, float]]:
+    """The individual of each true animal, and the share of its frames nearer to another animal."""
+    joints = [one.joints_camera for one in individuals]
+    distance = np.array(
+        [[error_of(ours, body.joints_camera) for ours in joints] for body in bodies]
+    )
+    if not distance.size:
+        return {}
+    distance = np.nan_to_num(distance, nan=1e6)  # (T, K, n)
+    pairs = zip(*linear_sum_assignment(np.median(distance, axis=2)), strict=True)
+    nearest = distance.argmin(axis=0)
+    posed = [np.isfinite(ours).all(axis=(1, 2)) for ours in joints]
+    return {t: (individuals[k], float((nearest[k] != t)[posed[k]].mean())) for t, k in pairs}
+
+
 def own_cases(animal: str, n_frames: int, sealed: bool, shares: Array) -> list[Foreign]:
     """The project's own foreign bodies, each in its recording; `shares` as in `truth_of`."""
     cases: list[Foreign] = []
@@ -140,7 +172,7 @@ def own_cases(animal: str, n_frames: int, sealed: bool, shares: Array) -> list[F
         recording = ForeignRecording(animal, int(body), FOREIGN_SEEDS[sealed], n_frames)
         name = f"{recording.name} {n_frames}"  # determines the content, which need not be hashed
         recording.files.known_digest = hashlib.sha256(name.encode()).hexdigest()
-        cases.append((recording, recording.animal(shares)))
+        cases.append((recording, {"": recording.animal(shares)}))
     return cases
 
 
@@ -155,14 +187,11 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
     Raises:
         LiexError: nothing is left, a recording is missing, or a truth file does not fit it.
     """
-    cases: list[Foreign] = []
+    cases: dict[Path, Foreign] = {}
     skipped: list[str] = []
     low, high = plan.animal.spine_min_mm, plan.animal.spine_max_mm
     for path in sorted(where.glob("*_truth*.npz")) if where.is_dir() else [where]:
-        name, _, which = path.stem.rpartition("_truth")
-        if name and which:
-            skipped.append(f"{path.name}: one of several animals; only single ones are scored")
-            continue
+        name, _, letter = path.stem.rpartition("_truth")
         beside = sorted(
             one
             for one in path.parent.glob("*")
@@ -173,14 +202,15 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
                 f"there is no recording beside {path}; give NAME_truth.npz the same NAME as its "
                 "recording, such as NAME.mcap"
             )
-        recording = open_recording(beside[0])
+        recording, bodies = cases.get(beside[0]) or (open_recording(beside[0]), {})
         try:
             with np.load(path, allow_pickle=False) as file:
                 body = truth_of(dict(file), path.name, recording, shares)
         except (OSError, ValueError, EOFError, TypeError, BadZipFile) as error:
             raise LiexError(f"{path} should be a truth file, but: {error}; {TRUTH_FORM}") from None
         if low <= body.spine_mm <= high:
-            cases.append((recording, body))
+            bodies[letter.strip("_")] = body
+            cases[beside[0]] = recording, bodies
         else:
             skipped.append(
                 f"{path.name}: {body.spine_mm:.3g} mm long, and a {plan.animal.name} has {low:g} "
@@ -191,7 +221,7 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
             f"{where} has no recording with a truth file to score: "
             f"{'; '.join(skipped) or 'check the path'}"
         )
-    return cases, skipped
+    return [*cases.values()], skipped
 
 
 def body_figures(truth: TrueAnimal, one: MeasuredIndividual, skeleton: Skeleton) -> dict[str, Any]:

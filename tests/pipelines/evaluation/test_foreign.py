@@ -2,6 +2,7 @@
 recording is refused in one sentence.
 """
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.evaluation.scores import MeasuredIndividual
 from liex_lab.optics.camera import Camera
+from liex_lab.plan import Plan
 from tests.conftest import ABSENT, REFERENCE_DATA
 
 MOUSE = Skeleton.load("mouse")
@@ -150,9 +152,10 @@ def test_a_missing_array_is_named():
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording with a truth beside it, and truths of two animals."""
+    """Two recordings with truths beside them, one of these of two animals."""
     folder = tmp_path_factory.mktemp("given")
     convert("synthetic:walk?frames=3&sensor=primesense-qvga", folder / "b1.mcap")
+    shutil.copy(folder / "b1.mcap", folder / "two.mcap")
     (folder / "b1.toml").write_text("")
     for name in ("b1_truth", "two_truth_a", "two_truth_b"):
         np.savez(folder / f"{name}.npz", **{of: one[:3] for of, one in arrays().items()})
@@ -162,12 +165,40 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_recordings_with_a_truth_file_are_scored_and_others_named(given, monkeypatch):
     monkeypatch.setattr(foreign, "run_product", lambda *_: ([], ["no floor was found"], 1))
     result = foreign.evaluate_foreign("mouse", truth=given)
-    assert list(result["rows"]) == ["b1"]
+    assert list(result["rows"]) == ["b1", "two a", "two b"]
     row = result["rows"]["b1"]
     assert (row["found"], row["said"], row["exit_code"]) == (0.0, ["no floor was found"], 1)
     skipped = [sentence.split(":")[0] for sentence in result["skipped"]]
-    assert skipped == ["two_truth_a.npz", "two_truth_b.npz", "b1"]
-    assert (result["bodies"], result["summary"]["n_bodies"]) == ("given", 1)
+    assert skipped == ["b1", "two"]
+    assert (result["bodies"], result["summary"]["n_bodies"]) == ("given", 3)
+
+
+def test_of_several_animals_each_is_scored_against_its_own_truth(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    aside = np.array([80.0, 0.0, 0.0])
+    truths = {name: one[:3].copy() for name, one in arrays().items()}
+    for letter in ("a", "b"):
+        np.savez(tmp_path / f"two_truth_{letter}.npz", **truths)
+        truths["joints"] += aside
+    shutil.copy(given / "b1.mcap", tmp_path / "two.mcap")
+    joints = measured().joints_camera[:3]
+    exchanged = np.array([joints[0], joints[1] + aside, joints[2]])
+    ours = [
+        MeasuredIndividual(one, np.ones(3, np.bool_), np.ones(joints.shape), np.full(3, 3.0))
+        for one in (joints + aside, exchanged)
+    ]
+    counts = []
+
+    def pretend(recording: object, plan: Plan) -> tuple[list[MeasuredIndividual], list[str], int]:
+        counts.append(plan.animal.count)
+        return ours, [], 0
+
+    monkeypatch.setattr(foreign, "run_product", pretend)
+    rows = foreign.evaluate_foreign("mouse", truth=tmp_path)["rows"]
+    assert counts == [2]
+    assert rows["two b"]["across_mm"] < 0.1
+    assert (rows["two a"]["exchanged"], rows["two b"]["exchanged"]) == (pytest.approx(1 / 3), 0.0)
 
 
 def test_a_body_of_another_length_than_the_plans_is_left_out(given):
