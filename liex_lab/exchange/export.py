@@ -71,6 +71,11 @@ TARGETS: dict[str, tuple[str, str, str]] = {
         "_mabe.csv",
         "interactions in the form of the MABe challenge: agent, target, action, frames",
     ),
+    "moseq": (
+        "moseq.write_scalars",
+        "_scalars_moseq.csv",
+        "MoSeq's scalars by its definitions, in its own and in true millimetres, as CSV",
+    ),
     "csv": (
         "export.write_csv_folder",
         "_csv",

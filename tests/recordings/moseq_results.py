@@ -63,10 +63,11 @@ def write_results(
     flips: NDArray[np.bool_] | None = None,
     places: NDArray[np.float64] | None = None,
     acquisition: dict[str, Any] | None = None,
+    floor: float | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Write the file; returns its scalars. places: (n, 3) centroid x, y in the crop and angle."""
     n = len(depth)
-    floor = float(np.median(background[roi]))
+    floor = floor or float(np.median(background[roi]))
     high = [heights(one, background, roi) for one in depth]
     found = np.array([features(filtered(one)) for one in high])
     if places is None:

@@ -1,8 +1,8 @@
 """Reader of MoSeq's extractions, results_00.h5: full depth images from cut-outs of the animal.
 
 moseq2-extract keeps of every frame the height over the background in a square about the animal,
-cut at whole pixels, turned until the animal faces right, and, where a classifier said so, turned by
-half a turn more:
+cut at whole pixels and turned until the animal lies level, by half a turn more where a classifier
+found its head on the left:
 
     cut-out(q) = height(R(angle) (q - c) + c + corner),   corner = trunc(centroid - side / 2),
     c = (side / 2, side / 2),   height = whole mm of background - depth, 0 outside of [low, high].
@@ -112,7 +112,7 @@ def open_results(
             close=file.close,
             faults=monotone.faults,
             doubts=doubts,
-            metadata={**metadata.facts, **camera_file.metadata},
+            metadata={"profile": results.facts(), **metadata.facts, **camera_file.metadata},
         )
 
 
@@ -218,6 +218,11 @@ class _Results:
         centre = np.nan_to_num(np.stack([x, y], axis=1))
         self._from = np.trunc(centre - half).astype(int) + self.corner
 
+    def facts(self) -> dict[str, Any]:
+        """What MoSeq's own numbers refer to, for session.json."""
+        known = {"moseq_corner_px": self.corner.tolist(), "moseq_floor_mm": self.floor_mm}
+        return {name: value for name, value in known.items() if value is not None}
+
     def read(self, index: int) -> Depth | str:
         """Depth (H, W) float32 mm of a frame, or what is wrong with it."""
         depth = self.scene.copy()
@@ -271,7 +276,7 @@ class _Results:
         if raw is None or raw.shape != self.scene.shape or isinstance(frame, str):
             doubts.append(
                 "the file holds no raw first frame, with which frames put together again could be "
-                "compared; look at the replay before you trust them"
+                "compared; check the replay before you trust them"
             )
             return
         animal = (frame != self.scene) & (frame > 0) & (raw > 0)
@@ -287,7 +292,7 @@ class _Results:
 
 
 def _array(file: h5py.File, *names: str) -> NDArray[Any] | None:
-    """The first of these data sets that the file holds; None if there is none or it is empty."""
+    """The first of these data sets that the file holds; None if all are missing or empty."""
     for name in names:
         found = file.get(name)
         if getattr(found, "shape", None) is not None:

@@ -1,0 +1,135 @@
+"""MoSeq's scalars of a session, by the definitions of moseq2-extract, and in true millimetres.
+
+The height over the background, within 10 to 100 mm, is smoothed (median of 3 pixels, opening by 9),
+and the largest outline gives centroid (x, y), direction of the long axis, and with the eigenvalues
+l of its second moments the lengths 2 sqrt(2) sqrt(2 l), px. Area and mean height are those of the
+pixels within 40 px. MoSeq takes the angle of view where its tangent belongs, and the floor's
+distance D for every height:
+
+    x_mm = D (x - 256) / 415.5,    y_mm = D (y - 212) / 404.9    (px from the corner of its crop),
+
+and its area_mm is pixels times mm. In true mm, a pixel is Z / f wide, with the camera's focal
+length f and the distance Z = D - height_ave_mm of the animal.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from liex_lab.runtime.text_files import write_csv
+from liex_lab.sessions import Session
+from liex_lab.sessions.cutouts import open_depth, still_scene
+from liex_lab.sessions.session import Array
+
+_LOW_MM, _HIGH_MM = 10, 100
+_HALF_PX = 40
+_CENTRE_PX = np.array([256.0, 212.0])  # MoSeq's, for every camera
+_FOCAL_PX = np.array([512.0, 424.0]) / np.radians([70.6, 60.0])
+_TAIL = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
+
+
+def write_scalars(session: Session, path: Path) -> None:
+    """Write `scalars_moseq` as CSV.
+
+    Raises:
+        SessionError: the session keeps no depth images.
+    """
+    write_csv(scalars_moseq(session), path)
+
+
+def scalars_moseq(session: Session) -> pd.DataFrame:
+    """MoSeq's eighteen scalars, one row per frame, NaN in frames without an animal.
+
+    Their names are MoSeq's; names with `true_mm` are metric, those that end in `_s` per second
+    (MoSeq's velocities are per frame, whatever time lies between). Head and tail, which the angle
+    needs, are those of the session.
+
+    Raises:
+        SessionError: the session keeps no depth images.
+    """
+    poses, frames, camera = session.pose_arrays(), session.frames, session.camera
+    with open_depth(session) as depth:
+        scene = still_scene(depth).astype(float)
+        px = np.array([_shape(scene - frame.depth, frame.depth > 0) for frame in depth])
+    centroid, axis, length, width, area, height = (
+        px[:, :2],
+        px[:, 2],
+        px[:, 3],
+        px[:, 4],
+        px[:, 5],
+        px[:, 6],
+    )
+    stated = session.metadata["input"].get("profile", {})
+    floor_mm = stated.get("moseq_floor_mm", float(session.T_arena_camera.translation[2]))
+    corner = np.array(stated.get("moseq_corner_px", (0, 0)))
+    ahead = (poses.uv_px[:, -1] - poses.uv_px[:, 0]) * (1, -1)
+    behind = np.sum(ahead * np.stack([np.cos(axis), np.sin(axis)], axis=1), axis=1) < 0
+    places = {
+        "px": np.column_stack([centroid - corner, height]),
+        "mm": np.column_stack([(centroid - corner - _CENTRE_PX) * floor_mm / _FOCAL_PX, height]),
+        "true_mm": np.column_stack([camera.unproject(centroid, floor_mm - height)[:, :2], height]),
+    }
+    scales: dict[str, Array] = {
+        "px": np.ones((1, 2)),
+        "mm": floor_mm / _FOCAL_PX[None],
+        "true_mm": (floor_mm - height)[:, None] / (camera.fx, camera.fy),
+    }
+    table: dict[str, Any] = {name: frames[name] for name in ("frame_index", "time_s")}
+    dt_s = frames["dt_s"].to_numpy(float)
+    for unit, at in places.items():
+        step = np.diff(at, axis=0, prepend=at[:1])
+        along, across = scales[unit].T
+        table |= {f"centroid_{name}_{unit}": at[:, k] for k, name in enumerate("xy")}
+        for n in (2, 3):
+            speed = np.linalg.norm(step[:, :n], axis=1)
+            table |= {f"velocity_{n}d_{unit}": speed, f"velocity_{n}d_{unit}_s": speed / dt_s}
+        table |= {f"length_{unit}": length * along, f"width_{unit}": width * across}
+    table |= {
+        "area_px": area,
+        "area_mm": area * scales["mm"].mean(),
+        "area_true_mm2": area * scales["true_mm"].prod(axis=1),
+        "height_ave_mm": height,
+        "angle": _unwrapped(axis + np.pi * behind),
+        "velocity_theta": np.arctan2(*np.diff(places["mm"][:, :2], axis=0, prepend=np.nan).T[::-1]),
+        "dist_to_center_px": np.linalg.norm(centroid - _middle_px(session), axis=1),
+    }
+    return pd.DataFrame(table)
+
+
+def _shape(height: Array, is_read: NDArray[np.bool_]) -> tuple[float, ...]:
+    """Centroid u, v px, direction rad, length, width px, area px and height mm; NaN for none."""
+    kept = is_read & (height >= _LOW_MM) & (height <= _HIGH_MM)
+    smooth = cv2.medianBlur(np.where(kept, height, 0).astype(np.uint8), 3)
+    smooth = cv2.morphologyEx(smooth, cv2.MORPH_OPEN, _TAIL)
+    mask = (smooth > _LOW_MM).astype(np.uint8)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_TREE, cv2.CHAIN_APPROX_SIMPLE)
+    moments = cv2.moments(max(outlines, key=cv2.contourArea)) if outlines else {"m00": 0.0}
+    if not moments["m00"]:
+        return (np.nan,) * 7
+    m, a, b, c = (moments[name] for name in ("m00", "mu20", "mu02", "mu11"))
+    root = np.hypot(2 * c, a - b)
+    long, short = (2 * np.sqrt(2 * max((a + b + sign * root) / m, 0)) for sign in (1, -1))
+    u, v = moments["m10"] / m, moments["m01"] / m
+    left, top = int(max(u - _HALF_PX, 0)), int(max(v - _HALF_PX, 0))
+    own = smooth[top : int(v) + _HALF_PX, left : int(u) + _HALF_PX]
+    own = own[(own > _LOW_MM) & (own < _HIGH_MM)]
+    return u, v, -0.5 * np.arctan2(2 * c, a - b), long, short, len(own), own.mean()
+
+
+def _unwrapped(angle: Array) -> Array:
+    """Angles (n,) without jumps of a whole turn; NaN stays."""
+    known = np.isfinite(angle)
+    angle[known] = np.unwrap(angle[known])
+    return angle
+
+
+def _middle_px(session: Session) -> Array:
+    """Pixel (2,) of the arena's centre on the floor; NaN where the arena's shape is not known."""
+    if session.arena.centre_mm is None:
+        return np.full(2, np.nan)
+    into = session.T_arena_camera.inverse()
+    return session.camera.project(into @ np.array([*session.arena.centre_mm, 0.0]))
