@@ -161,8 +161,8 @@ def export(
         typer.Option(
             "--to",
             metavar="FORMAT",
-            help="nwb, boris, dlc (deeplabcut), movement, sleap, points, mabe, moseq, csv, xlsx "
-            "or video.",
+            help="nwb, boris, dlc (deeplabcut), movement, sleap, points, mabe, moseq, csv, xlsx or "
+            "video.",
         ),
     ],
     out: Annotated[

@@ -353,7 +353,8 @@ class MeasuredIndividual:
         R_arena_camera: (3, 3) from the axes of `joints_camera` to the arena's.
         crossings: (k, 3) first frame, frame after the last, and probability of an exchange, of the
             stretches in which it may have been exchanged with another one.
-        unclear: (n,) bool, whether the tables flag a pose as good, but not clearly this animal's.
+        clear: (n,) bool, False where the tables flag a pose as good, but not clearly this animal's;
+            None if there is only one.
     """
 
     joints_camera: Array
@@ -362,7 +363,7 @@ class MeasuredIndividual:
     expected_mm: Array = field(default_factory=lambda: np.zeros(0))
     R_arena_camera: Array = field(default_factory=lambda: np.eye(3))
     crossings: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    unclear: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
+    clear: Mask | None = None
 
 
 class Tally:

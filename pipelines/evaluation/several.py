@@ -164,8 +164,8 @@ def _named(
             str(taken[k]),
             recording.skeleton,
             one.joints_camera @ one.R_arena_camera.T,
-            one.trusted | one.unclear,
-            ~one.unclear,
+            one.trusted if one.clear is None else one.trusted | ~one.clear,
+            one.clear,
         )
         for k, one in enumerate(individuals)
     ]
