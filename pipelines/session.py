@@ -669,6 +669,7 @@ def conclude(
         closing["results"] |= more["results"]
         closing["columns"] += more["columns"]
         closing["record"] |= more["record"]
+        closing["together"] = together
     return writer.close(timings_s=timings, **closing)
 
 

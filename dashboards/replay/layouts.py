@@ -56,7 +56,8 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     animal = session["animal"]
     corrected = bool(session.get("corrections"))
     at = corrected_entity if corrected else str
-    measured = ["skeleton", "body", "uncertainty", "root"] if corrected else []
+    # the other animals of the arena are as they were measured
+    measured = ["skeleton", "body", "uncertainty", "root", "animals"] if corrected else []
     body_m = float(animal.get("spine_mm") or animal["home_length_mm"]) / 1000.0
     hidden = [OVERLAY, corrected_entity(OVERLAY), *(f"arena/{name}" for name in measured)]
     scene = _scene(body_m, at(SKELETON), ["$origin/**", *(f"- /{name}/**" for name in hidden)])
@@ -76,7 +77,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         contents=[
             "$origin/**",
             f"+ /{rrd_scene.CUTOUTS}/**",
-            *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected),
+            *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones", "animals/**") if corrected),
         ],
         overrides={} if kept in (cutouts.ALL, cutouts.NONE) else frames,
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
@@ -89,7 +90,11 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         )
         image = rrb.Vertical(zoomed, image)
     return _blueprint(
-        rrb.Vertical(rrb.Horizontal(scene, image), *_over_time(at, animal), row_shares=[5, 1.6, 2])
+        rrb.Vertical(
+            rrb.Horizontal(scene, image),
+            *_over_time(at, animal),
+            row_shares=[5, 1.6 * n_boxes / 2, 2],
+        )
     )
 
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import combinations, permutations
+from itertools import combinations, pairwise, permutations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -90,19 +90,43 @@ class Interactions:
         events: the table `interactions` without session_id.
         totals: the table `interaction_totals` without session_id.
         limits: the thresholds.
-        names: of the animals.
+        animals: in the order of the arena.
     """
 
     events: pd.DataFrame
     totals: pd.DataFrame
     limits: InteractionThresholds
-    names: tuple[str, ...]
+    animals: tuple[Individual, ...]
+
+    def states(self) -> dict[tuple[str, str], list[tuple[int, int, float, float, str]]]:
+        """What each agent does to each target: spans in order, without those of nothing.
+
+        Returns:
+            By agent and target: first frame, frame after the last, start and stop, s, and the words
+            at that time with ", " between them.
+        """
+        found: dict[tuple[str, str], list[tuple[int, int, float, float, str]]] = {}
+        events = self.events[self.events["target"] != ""]
+        for (agent, target), own in events.groupby(["agent", "target"], sort=False):
+            start, stop, words = (
+                own[name].to_numpy() for name in ("start_frame", "stop_frame", "action")
+            )
+            ends, starts = (
+                dict(zip(*one, strict=True))
+                for one in ((stop, own["stop_s"]), (start, own["start_s"]))
+            )
+            spans = found.setdefault((str(agent), str(target)), [])
+            for (a, a_s), (b, b_s) in pairwise(sorted((ends | starts).items())):
+                now = words[(start <= a) & (stop > a)]
+                if len(now):
+                    spans.append((int(a), int(b), a_s, b_s, ", ".join(now)))
+        return found
 
     def for_session(self, session_id: str) -> dict[str, Any]:
         """Tables, descriptions of their columns and notes, as `SessionWriter.close` takes them."""
         tables = zip(TABLES, (self.events, self.totals), strict=True)
         about = {
-            "individuals": list(self.names),
+            "individuals": [one.name for one in self.animals],
             "limits": self.limits.model_dump(),
             "definitions": definitions(self.limits),
         }
@@ -116,6 +140,7 @@ class Interactions:
             },
             "columns": INTERACTIONS,
             "record": {"interactions": about},
+            "together": self,
         }
 
 
@@ -160,7 +185,7 @@ def find_interactions(
             "directed": np.array([one.directed for one in found], bool),
         }
     )
-    return Interactions(events, _totals(arena, found, names), limits, tuple(names))
+    return Interactions(events, _totals(arena, found, names), limits, tuple(animals))
 
 
 class _Event(NamedTuple):

@@ -5,11 +5,16 @@ animals of the arena, in the same order in every session.
 """
 
 from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from liex_lab.actions.vocabulary import individual_colours
+from liex_lab.behaviour.interactions import Interactions
 from liex_lab.errors import SessionError, refuse
+from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.session import Session
 
 
@@ -79,3 +84,39 @@ def individuals(sessions: Sequence[Session]) -> list[Session]:
         ),
     )
     return [session for _, session in sorted(zip(map(names.index, own), sessions, strict=True))]
+
+
+@dataclass(frozen=True)
+class OtherAnimal:
+    """Another animal of the arena, as a session's replay shows it in n frames.
+
+    Attributes:
+        name: of the animal.
+        colour: 0xRRGGBB.
+        joints_mm: (n, J, 3) arena frame; NaN without a pose.
+        uv_px: (n, J, 2) px of the depth image.
+    """
+
+    name: str
+    colour: int
+    joints_mm: NDArray[np.float64]
+    uv_px: NDArray[np.float64]
+
+
+def in_replay(
+    origin: Provenance, together: Interactions | None
+) -> tuple[int | None, list[OtherAnimal]]:
+    """The colour 0xRRGGBB of a session's animal beside others, and these; None and [] if alone."""
+    if together is None:
+        return None, []
+    colours = individual_colours([one.name for one in together.animals])
+    numbers = {name: int(colour[1:], 16) for name, colour in colours.items()}
+    into = origin.T_arena_camera.inverse()
+    others = [
+        OtherAnimal(
+            one.name, numbers[one.name], one.joints_mm, origin.camera.project(into @ one.joints_mm)
+        )
+        for one in together.animals
+        if one.name != origin.individual
+    ]
+    return numbers[origin.individual], others

@@ -41,10 +41,12 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
+from liex_lab.behaviour.interactions import Interactions
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.formats.messages.mcap import MAGIC, MESSAGE, RECORD
 from liex_lab.runtime.memory import blocks
+from liex_lab.sessions.individuals import OtherAnimal, in_replay
 from liex_lab.sessions.provenance import Provenance, package_version
 from liex_lab.sessions.rrd_scene import dot_mm
 from liex_lab.tables.rows import Rows
@@ -294,7 +296,20 @@ _PROTOBUF: dict[str, Any] = {
     "/camera/skeleton": messages.ImageAnnotations,
     "/log": messages.Log,
 }
-_JSON = {"/predicted_error": _ERROR_SCHEMA, "/actions": _ACTION_SCHEMA}
+_TOGETHER_SCHEMA: dict[str, Any] = {
+    "title": "liex_lab.InteractionState",
+    "description": "What one animal does to another from now on; empty for nothing.",
+    "type": "object",
+    "properties": {
+        "timestamp": _TIME,
+        **{name: {"type": "string"} for name in ("agent", "target", "interactions")},
+    },
+}
+_JSON = {
+    "/predicted_error": _ERROR_SCHEMA,
+    "/actions": _ACTION_SCHEMA,
+    "/interactions": _TOGETHER_SCHEMA,
+}
 _TYPES = {
     topic: (schema.name, schema.encoding, schema.data, "protobuf")
     for topic, kind in _PROTOBUF.items()
@@ -305,6 +320,14 @@ _TYPES = {
 }
 _BONE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _JOINT = messages.Color(r=1.0, g=0.31, b=0.24, a=1.0)
+# an animal in a frame: entity id, joints in m and px, whether it has a pose, and its colours
+_Body = tuple[str, Array, Array, bool, messages.Color, messages.Color]
+
+
+def _colour(number: int) -> messages.Color:
+    """0xRRGGBB as a colour."""
+    r, g, b = (part / 255.0 for part in number.to_bytes(3, "big"))
+    return messages.Color(r=r, g=g, b=b, a=1.0)
 
 
 def _packing_of(origin: Provenance) -> dict[str, int]:
@@ -358,6 +381,7 @@ class McapWriter:
             **{**_packing_of(origin), **chosen},
         )
         self._calibrated_ns: int | None = None
+        self._bone, self._joint = _BONE, _JOINT
 
     def _log_message(self, topic: str, time_ns: int, message: Any) -> None:
         self._log.log(topic, [message.encode()], time_ns)
@@ -385,7 +409,12 @@ class McapWriter:
                     self._log.log(_DEPTH, _raw_image(time_ns, image), time_ns)
 
     def finish(
-        self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str], problems: Sequence[str]
+        self,
+        rows: Rows,
+        bouts: pd.DataFrame,
+        words: Sequence[str],
+        problems: Sequence[str],
+        together: Interactions | None = None,
     ) -> None:
         """Write skeleton, transforms, actions and notes of the whole track, and close the file.
 
@@ -394,15 +423,22 @@ class McapWriter:
             bouts: the table `bouts`.
             words: the ethogram's vocabulary; a word's position is its index in the messages.
             problems: sentences about the recording, logged as warnings at the first frame.
+            together: the interactions with other animals of the arena, which are shown with them;
+                None if it is alone.
 
         Raises:
             OSError: a write failed.
         """
         track = rows.track
+        colour, others = in_replay(self._origin, together)
+        if colour is not None:
+            self._bone = self._joint = _colour(colour)
         with _naming(self._path):
             for part in blocks(track.n_frames, _BLOCK):
-                self._log_track(track[part])
+                self._log_track(track[part], others, part)
             self._log_actions(rows, bouts, words)
+            if together is not None:
+                self._log_together(rows, together)
             for problem in problems if len(track.times_ns) else ():
                 first_ns = int(track.times_ns[0])
                 note = messages.Log(
@@ -414,14 +450,22 @@ class McapWriter:
                 self._log_message("/log", first_ns, note)
         self.abandon()
 
-    def _log_track(self, track: Track) -> None:
-        """Skeleton and transforms of some frames."""
+    def _log_track(self, track: Track, others: Sequence[OtherAnimal], part: slice) -> None:
+        """Skeletons and transforms of some frames, of others those of the rows `part`."""
         posed = track.posed
         quaternions = so3.quaternion(np.where(posed[:, None, None], track.root_rotation, np.eye(3)))
         for i, time_ns in enumerate(track.times_ns.tolist()):
             joints_m = track.joints_mm[i] / 1000.0
             found = bool(posed[i])
-            scene = self._scene_update(time_ns, joints_m, found)
+            bodies: list[_Body] = [
+                ("skeleton", joints_m, track.uv_px[i], found, self._bone, self._joint)
+            ]
+            for one in others:
+                own = one.joints_mm[part.start + i] / 1000.0
+                there, colour = bool(np.isfinite(own).all()), _colour(one.colour)
+                uv = one.uv_px[part.start + i]
+                bodies.append((f"skeleton of {one.name}", own, uv, there, colour, colour))
+            scene = self._scene_update(time_ns, bodies)
             self._log_message("/skeleton/scene", time_ns, scene)
             joints = messages.PosesInFrame(
                 timestamp=_stamp(time_ns),
@@ -429,7 +473,7 @@ class McapWriter:
                 poses=[_place(*xyz) for xyz in joints_m.tolist()] if found else [],
             )
             self._log_message("/skeleton/joints", time_ns, joints)
-            overlay = self._annotations(time_ns, track.uv_px[i], found)
+            overlay = self._annotations(time_ns, bodies)
             self._log_message("/camera/skeleton", time_ns, overlay)
             if found:
                 root = _transform(time_ns, "root", track.root_mm[i], quaternions[i])
@@ -477,55 +521,67 @@ class McapWriter:
         turn = so3.quaternion(place.rotation)
         self._log_message("/tf", time_ns, _transform(time_ns, "camera", place.translation, turn))
 
-    def _scene_update(self, time_ns: int, joints_m: Array, found: bool) -> messages.SceneUpdate:
-        """Bones as lines and joints as spheres under one entity id, which is deleted without a
-        pose.
-        """
+    def _scene_update(self, time_ns: int, bodies: Sequence[_Body]) -> messages.SceneUpdate:
+        """Bones as lines and joints as spheres; an entity id per animal, deleted without a pose."""
         stamp = _stamp(time_ns)
-        if not found:
-            gone = messages.SceneEntityDeletion(
-                timestamp=stamp, type=messages.SceneEntityDeletionType.MatchingId, id="skeleton"
-            )
-            return messages.SceneUpdate(deletions=[gone])
-        points = [messages.Point3(x=x, y=y, z=z) for x, y, z in joints_m.tolist()]
-
-        lines = messages.LinePrimitive(
-            type=messages.LinePrimitiveLineType.LineList,
-            pose=_place(0.0, 0.0, 0.0),
-            thickness=0.7 * self._dot_m,
-            points=[points[end] for edge in self._origin.skeleton.edges for end in edge],
-            color=_BONE,
-        )
         across = 2.0 * self._dot_m
         size = messages.Vector3(x=across, y=across, z=across)
-        spheres = [
-            messages.SpherePrimitive(pose=_place(*xyz), size=size, color=_JOINT)
-            for xyz in joints_m.tolist()
-        ]
-        entity = messages.SceneEntity(
-            timestamp=stamp,
-            frame_id="arena",
-            id="skeleton",
-            lifetime=messages.Duration(sec=0, nsec=0),
-            lines=[lines],
-            spheres=spheres,
-        )
-        return messages.SceneUpdate(entities=[entity])
+        entities, gone = [], []
+        for name, joints_m, _, found, bone, joint in bodies:
+            if not found:
+                kind = messages.SceneEntityDeletionType.MatchingId
+                gone.append(messages.SceneEntityDeletion(timestamp=stamp, type=kind, id=name))
+                continue
+            points = [messages.Point3(x=x, y=y, z=z) for x, y, z in joints_m.tolist()]
+            lines = messages.LinePrimitive(
+                type=messages.LinePrimitiveLineType.LineList,
+                pose=_place(0.0, 0.0, 0.0),
+                thickness=0.7 * self._dot_m,
+                points=[points[end] for edge in self._origin.skeleton.edges for end in edge],
+                color=bone,
+            )
+            spheres = [
+                messages.SpherePrimitive(pose=_place(*xyz), size=size, color=joint)
+                for xyz in joints_m.tolist()
+            ]
+            entities.append(
+                messages.SceneEntity(
+                    timestamp=stamp,
+                    frame_id="arena",
+                    id=name,
+                    lifetime=messages.Duration(sec=0, nsec=0),
+                    lines=[lines],
+                    spheres=spheres,
+                )
+            )
+        return messages.SceneUpdate(entities=entities, deletions=gone)
 
-    def _annotations(self, time_ns: int, uv: Array, found: bool) -> messages.ImageAnnotations:
-        """The skeleton over the depth image."""
-        if not found:
-            return messages.ImageAnnotations(points=[])
-        at = [messages.Point2(x=u, y=v) for u, v in uv.tolist()]
+    def _annotations(self, time_ns: int, bodies: Sequence[_Body]) -> messages.ImageAnnotations:
+        """The skeletons over the depth image."""
+        drawn = []
+        for _, _, uv, found, _, joint in bodies:
+            at = [messages.Point2(x=u, y=v) for u, v in uv.tolist()]
+            if found:
+                drawn.append(
+                    messages.PointsAnnotation(
+                        timestamp=_stamp(time_ns),
+                        type=messages.PointsAnnotationType.LineList,
+                        points=[at[end] for edge in self._origin.skeleton.edges for end in edge],
+                        outline_color=joint,
+                        thickness=1.5,
+                    )
+                )
+        return messages.ImageAnnotations(points=drawn)
 
-        lines = messages.PointsAnnotation(
-            timestamp=_stamp(time_ns),
-            type=messages.PointsAnnotationType.LineList,
-            points=[at[end] for edge in self._origin.skeleton.edges for end in edge],
-            outline_color=_JOINT,
-            thickness=1.5,
-        )
-        return messages.ImageAnnotations(points=[lines])
+    def _log_together(self, rows: Rows, together: Interactions) -> None:
+        """One message per change of what an agent does to a target; empty where it ends."""
+        first = int(rows.track.times_ns[0])
+        for (agent, target), spans in together.states().items():
+            changes = {stop_s: "" for _, _, _, stop_s, _ in spans}
+            changes |= {start_s: words for _, _, start_s, _, words in spans}
+            for at_s, words in sorted(changes.items()):
+                state = {"agent": agent, "target": target, "interactions": words}
+                self._log_json("/interactions", first + round(at_s * 1e9), state)
 
     def _log_actions(self, rows: Rows, bouts: pd.DataFrame, words: Sequence[str]) -> None:
         """One message per change, at the time of its frame."""

@@ -20,11 +20,14 @@ from numpy.typing import NDArray
 
 from liex_lab.actions import vocabulary
 from liex_lab.behaviour.body import logged_of
+from liex_lab.behaviour.interactions import Interactions
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.runtime import durable, memory
 from liex_lab.sessions.checkpoint import RRD_HEAD, rrd_messages
 from liex_lab.sessions.cutouts import Boxes
+from liex_lab.sessions.individuals import OtherAnimal, in_replay
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.sessions.rrd_scene import (
     IMAGE,
@@ -56,6 +59,8 @@ UNCERTAINTY = "arena/uncertainty"
 CANDIDATES = "arena/candidates"
 ACTIONS = "ethogram/predicted"
 TRACKING = "ethogram/tracking"
+TOGETHER = "ethogram/interactions"
+ANIMALS = "arena/animals"
 _BLOCK = 8192  # frames of small data sent at once
 _FLAG_COLOURS = {
     "doubtful": 0xCCBB44,
@@ -164,6 +169,7 @@ class ReplayWriter:
         words: Sequence[str],
         problems: Sequence[str],
         candidates: Observations | None = None,
+        together: Interactions | None = None,
     ) -> None:
         """Write skeleton, scalars, lanes and notes of the whole track, and close the file.
 
@@ -174,6 +180,8 @@ class ReplayWriter:
             words: the ethogram's vocabulary, coloured by `vocabulary.action_colours`.
             problems: sentences about the recording, logged as warnings.
             candidates: the pose hypotheses of single frames, to be shown as well; None if absent.
+            together: the interactions with other animals of the arena, which are shown with them;
+                None if it is alone.
 
         Raises:
             SessionError: the file was not written completely.
@@ -185,17 +193,27 @@ class ReplayWriter:
         self._elapsed = track.times_ns - track.times_ns[:1]
         curves = self._log_curves(rows, kinematics)
         carriers = self._log_styles(track, 0 if candidates is None else candidates.known.shape[1])
+        own, others = in_replay(self._origin, together)
+        if own is not None:
+            for name, skeleton, over, colour in (
+                (self._origin.individual, SKELETON, OVERLAY, own),
+                *((one.name, *_entities_of(one.name), one.colour) for one in others),
+            ):
+                self._log_animal(name, skeleton, over, colour)
         for part in memory.blocks(track.n_frames, _BLOCK):
             self._send_root(track, part)
             for entity, columns in chain(
                 _skeleton_columns(track[part]),
                 body_columns(track[part], carriers),
+                *(_other_columns(one, track.skeleton, part) for one in others),
                 () if candidates is None else _candidate_columns(candidates[part]),
                 ((curve, rr.Scalars.columns(scalars=curves[curve][part])) for curve in curves),
             ):
                 self._send(entity, part, columns)
             self._flush()  # limits the memory of a long recording
         self._log_lanes(rows, bouts, words)
+        if together is not None:
+            self._log_together(rows, together)
         self._log_worst(track.predicted_error_mm)
         if not self._corrected:
             log_hidden_places(self._stream, rows)
@@ -364,6 +382,29 @@ class ReplayWriter:
         animal = self._origin.animal_size
         return log_body(self._stream, skeleton, animal) if skeleton.surface else []
 
+    def _log_animal(self, name: str, skeleton: str, over: str, colour: int) -> None:
+        """Log name and colour of one of several animals, in space and over the depth image."""
+        dot_m, pt = (f(self._origin.skeleton) for f in (dot_mm, dot_pt))
+        style: dict[str, Any] = {"colors": rgba([colour])}
+        for entity, dots, lines, size in (
+            (skeleton, rr.Points3D, rr.LineStrips3D, dot_m / MM_PER_UNIT),
+            (over, rr.Points2D, rr.LineStrips2D, rr.Radius.ui_points(pt / 2.0)),
+        ):
+            points: Any = dots.from_fields(radii=size, show_labels=False, **style)
+            bones: Any = lines.from_fields(radii=size, labels=[name], show_labels=True, **style)
+            self._stream.log(f"{entity}/joints", points, static=True)
+            self._stream.log(f"{entity}/bones", bones, static=True)
+
+    def _log_together(self, rows: Rows, together: Interactions) -> None:
+        """Log a lane of the interactions of each agent towards each target."""
+        end = (int(rows.frame_index[-1]) + 1, float(stop_times(rows.time_s)[-1]))
+        own = vocabulary.action_colours([*vocabulary.INTERACTIONS])
+        for (agent, target), spans in together.states().items():
+            lane = rr.escape_entity_path_part(f"{agent} to {target}")
+            words = dict.fromkeys(span[-1] for span in spans)
+            colours = {word: int(own[word.partition(", ")[0]][1:], 16) for word in words}
+            self._log_lane(f"{TOGETHER}/{lane}", spans, colours, end)
+
     def _send_root(self, track: Track, part: slice) -> None:
         """Send the axes of the body's base; they keep their last pose while the animal is lost."""
         posed = part.start + np.flatnonzero(track.posed[part])
@@ -453,21 +494,35 @@ class _Renamed:
         return getattr(self._to, name)
 
 
-def _skeleton_columns(track: Track) -> Iterator[tuple[str, Any]]:
-    """Joints, bones and ellipsoids that contain the joints with 95 %; empty without a pose.
+def _entities_of(name: str) -> tuple[str, str]:
+    """The entities of another animal's skeleton, in space and over the depth image."""
+    part = rr.escape_entity_path_part(name)
+    return f"{ANIMALS}/{part}", f"{OVERLAY}/animals/{part}"
 
-    Half axes are 2.795 standard deviations of a Gaussian in space (a chi distribution with 3
-    degrees of freedom).
-    """
-    posed = track.posed
-    n_posed = int(posed.sum())
-    n_joints = track.skeleton.n_joints
-    edges = np.array(track.skeleton.edges, np.int64).reshape(-1, 2)
-    joints = track.joints_mm[posed] / MM_PER_UNIT
+
+def _other_columns(
+    other: OtherAnimal, skeleton: Skeleton, part: slice
+) -> Iterator[tuple[str, Any]]:
+    """Joints and bones of another animal of the arena; empty without a pose."""
+    joints, uv_px = other.joints_mm[part], other.uv_px[part]
+    posed = np.asarray(np.isfinite(joints).all(axis=(1, 2)))
+    yield from _chain_columns(_entities_of(other.name), skeleton, posed, joints, uv_px)
+
+
+def _chain_columns(
+    entities: tuple[str, str],
+    skeleton: Skeleton,
+    posed: NDArray[np.bool_],
+    joints_mm: Array,
+    uv_px: Array,
+) -> Iterator[tuple[str, Any]]:
+    """Joints and bones of n frames, in space and over the depth image; empty without a pose."""
+    n_posed, n_joints = int(posed.sum()), skeleton.n_joints
+    edges = np.array(skeleton.edges, np.int64).reshape(-1, 2)
     for entity, dot, line, points in (
-        (SKELETON, rr.Points3D, rr.LineStrips3D, joints),
+        (entities[0], rr.Points3D, rr.LineStrips3D, joints_mm[posed] / MM_PER_UNIT),
         # the 2D view counts from the image's corner; our pixels count from their centre
-        (OVERLAY, rr.Points2D, rr.LineStrips2D, track.uv_px[posed] + 0.5),
+        (entities[1], rr.Points2D, rr.LineStrips2D, uv_px[posed] + 0.5),
     ):
         size = points.shape[-1]
         dots = dot.columns(
@@ -478,10 +533,21 @@ def _skeleton_columns(track: Track) -> Iterator[tuple[str, Any]]:
         strips = line.columns(strips=points[:, edges].reshape(-1, 2, size).astype(np.float32))
         yield f"{entity}/joints", dots.partition(np.where(posed, n_joints, 0))
         yield f"{entity}/bones", strips.partition(np.where(posed, len(edges), 0))
+
+
+def _skeleton_columns(track: Track) -> Iterator[tuple[str, Any]]:
+    """Joints, bones and ellipsoids that contain the joints with 95 %; empty without a pose.
+
+    Half axes are 2.795 standard deviations of a Gaussian in space (a chi distribution with 3
+    degrees of freedom).
+    """
+    posed, skeleton = track.posed, track.skeleton
+    yield from _chain_columns((SKELETON, OVERLAY), skeleton, posed, track.joints_mm, track.uv_px)
+    joints = track.joints_mm[posed] / MM_PER_UNIT
     # standard deviations of a Gaussian in space
     axes = 2.795 * np.nan_to_num(track.sd_xyz_mm[posed]).reshape(-1, 3) / MM_PER_UNIT
     spheres = rr.Ellipsoids3D.columns(half_sizes=axes, centers=joints.reshape(-1, 3))
-    yield UNCERTAINTY, spheres.partition(np.where(posed, n_joints, 0))
+    yield UNCERTAINTY, spheres.partition(np.where(posed, skeleton.n_joints, 0))
 
 
 def _candidate_columns(observations: Observations) -> Iterator[tuple[str, Any]]:

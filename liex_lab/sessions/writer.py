@@ -28,6 +28,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from liex_lab.behaviour.interactions import Interactions
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime import durable, memory, text_files
@@ -335,6 +336,7 @@ class SessionWriter:
         actions: Mapping[str, str] | None = None,
         record: Mapping[str, Any] | None = None,
         timings_s: Mapping[str, float] | None = None,
+        together: Interactions | None = None,
     ) -> Session:
         """Write everything else and publish the session; returns it opened.
 
@@ -349,6 +351,7 @@ class SessionWriter:
             actions: the ethogram's vocabulary, word to definition.
             record: further sections of session.json (see `note`).
             timings_s: time spent on each part of the work, s.
+            together: the interactions with other animals of the arena, for the replays.
 
         Raises:
             SessionError: the recording has no frame, the track is of other frames, a column is not
@@ -378,8 +381,9 @@ class SessionWriter:
         actions = {**(actions or {}), **dict.fromkeys(named, "")}
         words = [*actions]
         problems = self._document["problems"]
-        self._replay.finish(rows, results["kinematics"], bouts, words, problems, self._candidates)
-        self._mcap.finish(rows, bouts, words, problems)
+        own = rows, results["kinematics"], bouts, words, problems
+        self._replay.finish(*own, self._candidates, together)
+        self._mcap.finish(rows, bouts, words, problems, together)
         self._checkpoint.join_replay()
         kept = self._checkpoint.columns.read()
         if BOXES in kept:

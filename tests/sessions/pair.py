@@ -38,5 +38,6 @@ def write_pair(folder: Path, seconds: float = 3.0, **more: Any) -> list[Session]
             closing["results"] |= own["results"]
             closing["columns"] = [*closing["columns"], *own["columns"]]
             closing["record"] = {**closing.get("record", {}), **own["record"]}
+            closing["together"] = together
             sessions.append(writer.close(**closing))
     return sessions
