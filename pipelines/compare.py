@@ -33,6 +33,7 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session, evidence
 from liex_lab.sessions.corrections import read_verdict
 from liex_lab.sessions.folder import FAILED_FILE, read_failure
+from liex_lab.sessions.individuals import individuals_of
 from liex_lab.sessions.verdict import NEEDS_REVIEW, OTHER_ANIMAL, Entry
 from liex_lab.tables.schema import dictionary, from_pandas, write_table
 
@@ -266,8 +267,9 @@ def find_copies(sessions: Mapping[str, Session]) -> dict[str, str]:
     for key, session in sessions.items():
         animals[key] = ", ".join(session.table("sessions")["subject_id"].astype(str))
         region = session.metadata.get("plan", {}).get("arena", {}).get("region")
+        own = session.metadata["individual"] if len(individuals_of(session)) > 1 else ""
         numbers = session.summary.select_dtypes("number").to_numpy().tolist()
-        marks = (f"{session.metadata['input']['sha256']} {region}", str(numbers))
+        marks = (f"{session.metadata['input']['sha256']} {region} {own}", str(numbers))
         twin = next((known[mark] for mark in marks if mark in known), key)
         if same(animals[twin]) != same(animals[key]):
             raise SessionError(

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from liex_lab.behaviour.interactions import PAIR, arena_measures
 from liex_lab.behaviour.statistics import (
     ANIMAL,
     CAGE,
@@ -40,6 +41,7 @@ from liex_lab.behaviour.statistics import (
 )
 from liex_lab.plan.study import alike, one_animal, references_first
 from liex_lab.tables.schema import shown, table_columns, titled, to_pandas
+from liex_lab.tracking.identity import CERTAIN
 
 if TYPE_CHECKING:
     from liex_lab.tables.schema import SessionTables
@@ -69,19 +71,36 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
 
     Returns:
         Columns of the tables `sessions` and `summary`, and n_bouts; a column of both tables has the
-            suffix `_summary` for the second.
+            suffix `_summary` for the second. Animals of one arena also have its name, `arena`,
+            whether they may have been exchanged, `exchanged`, and its `arena_measures`.
     """
     rows = [
         session.table("sessions")
         .merge(session.summary, on=["session_id", "individual"], suffixes=("", "_summary"))
-        .assign(n_bouts=len(session.table("bouts", ["action"])))
+        .assign(n_bouts=len(session.table("bouts", ["action"])), **_together(session))
         for session in sessions
     ]
     return pd.concat(rows or [pd.DataFrame(columns=["session_id", *SUBJECT])], ignore_index=True)
 
 
+def _together(session: SessionTables) -> dict[str, Any]:
+    """What the rows of the animals of one arena also have; nothing for one animal."""
+    about = session.metadata
+    if len((about.get("interactions") or {}).get("individuals", ())) < 2:
+        return {}
+    name = str(about["session_id"]).removesuffix(f"-{about['individual']}")
+    known = "crossings.parquet" in about.get("files", {})
+    swaps = session.table("crossings")["p_swap"].to_numpy(float) if known else np.empty(0)
+    return {
+        "arena": f"{name} {str(about['input']['sha256'])[:6]}",
+        "exchanged": bool(np.prod(1.0 - swaps) < CERTAIN),
+        **arena_measures(session.table("interaction_totals")),
+    }
+
+
 def usual_measures(table: pd.DataFrame) -> list[str]:
-    """The default measures: the usual ones with values, and every action's share.
+    """The default measures: the usual ones with values, every action's share, and how often the
+    animals of an arena interact.
 
     Args:
         table: one row per session, see `collect`.
@@ -95,7 +114,14 @@ def usual_measures(table: pd.DataFrame) -> list[str]:
         if str(name).removesuffix("_share") + "_count" in table.columns
         and str(name).endswith("_share")
     ]
-    return [name for name in (*_USUAL, *shares) if name in table and table[name].notna().any()]
+    pairs = [
+        str(name)
+        for name in table.columns
+        if str(name).startswith(PAIR) and str(name).endswith("_per_min")
+    ]
+    return [
+        name for name in (*_USUAL, *shares, *pairs) if name in table and table[name].notna().any()
+    ]
 
 
 def compare(
@@ -149,7 +175,8 @@ def compare(
 
 
 def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
-    """The table with one spelling of names that differ only in capitals, spaces, _ or -.
+    """The table with one spelling of names that differ only in capitals, spaces, _ or -, and a cage
+    for animals of one arena, which are not independent: theirs, or the arena if none is stated.
 
     Args:
         table: one row per session, see `collect`; its columns of `SUBJECT` are read.
@@ -162,6 +189,17 @@ def unified(table: pd.DataFrame) -> tuple[pd.DataFrame, list[str]]:
         for kept, *others in alike(table[column].fillna("").astype(str)):
             notes.append(f"{column} {', '.join(map(repr, others))} is taken for {kept!r}")
             table = table.assign(**{column: table[column].replace(others, kept)})
+    if "arena" in table:
+        cage = table.get("cage", pd.Series("", table.index)).fillna("").astype(str)
+        for arena, own in cage.groupby(table["arena"]):
+            stated = sorted(set(own) - {""})
+            cage[own.index] = stated[0] if len(stated) == 1 else str(arena)
+            if len(stated) > 1:
+                notes.append(
+                    f"the animals of the arena {arena} are of the cages {', '.join(stated)}: the "
+                    "arena counts as their cage"
+                )
+        table = table.assign(cage=cage)
     known = list(table["subject_id"].fillna("").astype(str)) if "subject_id" in table else []
     notes += [
         f"possible pseudo-replication: the animals {', '.join(ids)} may be one; if they are, give "
@@ -206,6 +244,7 @@ def _compare_one(
     }
     try:
         units = find_units(rows, groups, blocks)
+        _check_together(rows, measure, units)
         row |= {"unit": units.unit, "smallest_p": smallest_p(units)}
         n, n_second = len(units.values), int(units.second.sum())
         # paired units count in both
@@ -217,6 +256,29 @@ def _compare_one(
     except NotComparable as reason:
         row["refused"] = str(reason)
     return row
+
+
+def _check_together(rows: pd.DataFrame, measure: str, units: Units) -> None:
+    """Refuse what a comparison cannot say of the animals of one arena.
+
+    Raises:
+        NotComparable: they may have been exchanged, or a measure of the arena is compared between
+            its animals.
+    """
+    if "arena" not in rows:
+        return
+    if measure.startswith(PAIR):
+        if units.unit != CAGE and rows["arena"].duplicated().any():
+            raise NotComparable(
+                f"{measure} is of the arena and the same for all its animals, which are of both "
+                "groups; compare arenas of one group each"
+            )
+    elif doubtful := sorted(set(rows.loc[rows["exchanged"].eq(True), "arena"])):
+        raise NotComparable(
+            f"the animals of {', '.join(doubtful)} may have been exchanged (see the verdicts of "
+            "their sessions), too likely for statistics per animal; leave these sessions out "
+            f"(--only-trusted), or compare measures of the arena ({PAIR}...)"
+        )
 
 
 def _sized(found: Estimate, rows: pd.DataFrame, groups: tuple[str, str]) -> dict[str, float]:

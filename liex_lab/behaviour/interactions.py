@@ -53,6 +53,7 @@ _REST = _ALONG >= 0.45  # what touches when animals rest together
 _NECK, _CHEST = 3, 4  # places of a quarter and a third of the body
 _WALKERS = ("mount", "huddle")  # words that swimming animals do not have
 _BLOCK = 4096
+PAIR = "pair_"  # begins the name of a measure of an arena
 TABLES = ("interactions", "interaction_totals")
 
 
@@ -186,6 +187,26 @@ def find_interactions(
         }
     )
     return Interactions(events, _totals(arena, found, names), limits, tuple(animals))
+
+
+def arena_measures(totals: pd.DataFrame) -> dict[str, float]:
+    """Number per minute and share of each interaction in an arena, the mean over its pairs.
+
+    They are measures of the arena, the same for each of its animals: both directions are added.
+
+    Args:
+        totals: the table `interaction_totals`.
+
+    Returns:
+        `pair_WORD_per_min` and `pair_WORD_share`; NaN if no pair was observed.
+    """
+    means = totals[totals["target"] != ""].groupby("action")[["per_min", "share"]].mean()
+    return {
+        f"{PAIR}{word}_{name}": float(value) * (1.0 if WORDS[str(word)].mutual else 2.0)
+        for name, values in means.items()
+        for word, value in values.items()
+        if word in WORDS
+    }
 
 
 class _Event(NamedTuple):

@@ -12,9 +12,14 @@ from liex_lab.pipelines.compare import compare_groups, find_sessions
 from typer.testing import CliRunner
 
 from liex_lab import cli
+from liex_lab.behaviour import cohort
+from liex_lab.behaviour.cohort import collect
 from liex_lab.errors import SessionError
+from liex_lab.sessions import Session
 from liex_lab.sessions.folder import write_failure
 from liex_lab.sessions.verdict import OTHER_ANIMAL
+from liex_lab.tables.schema import CROSSINGS
+from tests.sessions.pair import write_pair
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 compare = partial(compare_groups, figures=False)
@@ -226,3 +231,66 @@ def test_a_recording_of_another_animal_is_told(accounted):
     assert any(
         "the study names the animal m3, and the recording's" in one for one in found["check"]
     )
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four arenas of two mice each, two of either group."""
+    folder = tmp_path_factory.mktemp("pairs")
+    for k, name in enumerate("wxyz"):
+        group = "drug" if k > 1 else "control"
+        sha256 = f"{k}" * 64
+        write_pair(folder / name, 0.8 + 0.1 * k, group, input_sha256=sha256)
+    return folder
+
+
+def test_animals_of_one_arena_are_one_unit_and_interactions_measures_of_the_arena(pairs, tmp_path):
+    measures = ["distance_m", "pair_contact_share", "pair_leave_per_min"]
+    found = compare([pairs], tmp_path, measures)
+    assert found["sessions"] == "8 sessions in the study, 8 compared"
+    stats = found["stats"].set_index("measure")
+    assert stats["unit"].eq("cage").all()
+    assert stats["n_group"].eq(2).all()
+    assert stats["n_animals"].eq(8).all()
+    table = pd.read_csv(tmp_path / "sessions.csv")
+    assert table["cage"].nunique() == table["arena"].nunique() == 4
+    first = Session.open(pairs / "w" / "pair-animal1.liex").interaction_totals
+    both = first.query("action == 'leave' and target != ''")["per_min"].sum()
+    own = table.query("subject_id.str.startswith('w_')")
+    assert own["pair_leave_per_min"].tolist() == pytest.approx([both, both])
+    mutual = first.query("action == 'contact'")["share"].unique()
+    assert own["pair_contact_share"].unique() == pytest.approx(mutual)
+    assert "pair_leave_per_min" in set(compare([pairs], tmp_path)["stats"]["measure"])
+
+
+def test_statistics_per_animal_are_refused_where_animals_may_have_been_exchanged(pairs, tmp_path):
+    table = collect([Session.open(one) for one in sorted(pairs.glob("*/*.liex"))])
+    doubtful = table.assign(exchanged=table["arena"].str.startswith("pair 3"))
+    measures = ["distance_m", "pair_contact_share"]
+    alone, together = cohort.compare(doubtful, measures).to_dict("records")
+    assert "may have been exchanged" in alone["refused"]
+    assert "--only-trusted" in alone["refused"]
+    assert "exchanged" not in together["refused"]
+    assert together["unit"] == "cage"
+    mixed = table.assign(group=["a", "b"] * 4)
+    of_animal, of_arena = cohort.compare(mixed, measures).to_dict("records")
+    assert of_animal["unit"] == "animal"  # within the arenas, as blocks
+    assert "of the arena and the same for all its animals" in of_arena["refused"]
+    two = table.assign(cage=[f"c{k % 2}" for k in range(8)])
+    kept, notes = cohort.unified(two)
+    assert kept["cage"].equals(table["arena"])
+    assert sum("the arena counts as their cage" in note for note in notes) == 4
+
+
+def test_a_session_with_likely_exchanges_says_so_in_its_row(pairs, tmp_path):
+    shutil.copytree(pairs / "w", tmp_path / "w")
+    folder = tmp_path / "w" / "pair-animal1.liex"
+    about = json.loads((folder / "session.json").read_text())
+    about["files"]["crossings.parquet"] = {"bytes": 1}
+    (folder / "session.json").write_text(json.dumps(about))
+    session = Session.open(folder)
+    names = [column.name for column in CROSSINGS]
+    row = pd.DataFrame([dict.fromkeys(names, "")]).assign(start_s=0.0, stop_s=0.1, p_swap=0.3)
+    row = row.assign(start_frame=0, stop_frame=3)
+    row.to_parquet(folder / "crossings.parquet")
+    assert collect([session])["exchanged"].tolist() == [True]

@@ -11,10 +11,10 @@ from tests.sessions.walking_mouse import WalkingMouse, steady
 NAMES = ("animal1", "animal2")
 
 
-def write_pair(folder: Path, seconds: float = 3.0, **more: Any) -> list[Session]:
+def write_pair(folder: Path, seconds: float = 3.0, group: str = "", **more: Any) -> list[Session]:
     """The second walks closer inside, faster, so that it passes the first; it is lost in frame 20.
 
-    `more` goes to the provenance.
+    Those of a group have subjects named after the folder. `more` goes to the provenance.
     """
     times = steady(seconds)
     mice = (
@@ -27,6 +27,8 @@ def write_pair(folder: Path, seconds: float = 3.0, **more: Any) -> list[Session]
     sessions = []
     for name, mouse, track in zip(NAMES, mice, tracks, strict=True):
         facts = {"name": f"pair-{name}", "individual": name, "input_sha256": "ab" * 32} | more
+        if group:
+            facts["subject"] = {"subject_id": f"{folder.name}_{name}", "group": group}
         path = folder / f"pair-{name}.liex"
         with SessionWriter(path, mouse.provenance(**facts)) as writer:
             for frames, _ in mice[0].chunks(30):
