@@ -65,8 +65,8 @@ def test_every_verb_explains_itself(words: list[str]) -> None:
 
 
 IMPERATIVES = {
-    *("Apply", "Check", "Compare", "Convert", "Correct", "Draw", "Edit", "Exchange", "Export"),
-    *("List", "Make", "Measure", "Move", "Open", "Pack", "Put", "Redo", "Regenerate", "Report"),
+    *("Apply", "Check", "Compare", "Confirm", "Convert", "Correct", "Draw", "Edit", "Exchange", "Export"),
+    *("List", "Make", "Measure", "Move", "Open", "Pack", "Put", "Record", "Redo", "Regenerate", "Report"),
     *("Score", "Set", "Show", "Train", "Undo", "Write"),
 }
 
