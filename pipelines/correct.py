@@ -648,7 +648,7 @@ def edited_bouts(
     """Ethogram with manual edits applied in order.
 
     Each edit clears the bout that it edits, then its own span: a bout that overlaps the span keeps
-    the part outside. Edited bouts have the source human, the score 1 and no model.
+    the part outside. Edited bouts have the score 1 and no model.
 
     Args:
         bouts: the table `bouts` of the session.
@@ -664,7 +664,7 @@ def edited_bouts(
             _cleared(rows, edit.was_start_ns, edit.was_stop_ns), edit.start_ns, edit.stop_ns
         )
         if edit.action:
-            edited = {"action": edit.action, "score": 1.0, "source": HUMAN, "model_hash": ""}
+            edited = {"action": edit.action, "score": 1.0, "source": edit.source, "model_hash": ""}
             rows.append({**edited, "start_ns": edit.start_ns, "stop_ns": edit.stop_ns})
     return _table(rows, frames)
 
@@ -722,9 +722,11 @@ def _spans(bouts: pd.DataFrame, frames: pd.DataFrame) -> list[dict[str, Any]]:
 
 def _cleared(rows: list[dict[str, Any]], start_ns: int, stop_ns: int) -> list[dict[str, Any]]:
     """Bouts with a span removed; a bout around the span becomes two."""
+    if stop_ns <= start_ns:
+        return rows
     kept: list[dict[str, Any]] = []
     for row in rows:
-        if stop_ns <= start_ns or row["stop_ns"] <= start_ns or row["start_ns"] >= stop_ns:
+        if row["stop_ns"] <= start_ns or row["start_ns"] >= stop_ns:
             kept.append(row)
             continue
         kept += [{**row, "stop_ns": start_ns}] if row["start_ns"] < start_ns else []

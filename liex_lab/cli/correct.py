@@ -86,7 +86,9 @@ def bout(
     labels: Annotated[
         Path | None,
         typer.Option(
-            "--labels", metavar="FILE", help="Import a whole ethogram: .csv, .parquet or .boris."
+            "--labels",
+            metavar="FILE",
+            help="Import a whole ethogram: .csv, .parquet, .boris, or syllables (results.h5).",
         ),
     ] = None,
     new_word: Annotated[
@@ -107,7 +109,8 @@ def bout(
         case (None, None, None, None, False, Path()):
             from liex_lab.sessions.correcting import labelled_bouts
 
-            _do(session, labelled_bouts(_opened(session), api.read_any_labels(labels)), by)
+            opened = _opened(session)
+            _do(session, labelled_bouts(opened, api.read_any_labels(labels, opened)), by)
         case (None, str(), float(), float(), False, None):
             _parse_and_apply(session, ["add", action, start_s, stop_s, *new], by)
         case (float(), str(), None, None, False, None):

@@ -1,4 +1,6 @@
-"""MoSeq's scalars of a session, by the definitions of moseq2-extract, and in true millimetres.
+"""MoSeq's scalars of a session, by its definitions and in true millimetres; MoSeq's syllables.
+
+Scalars are those of moseq2-extract.
 
 The height over the background, within 10 to 100 mm, is smoothed (median of 3 pixels, opening by 9),
 and the largest outline gives centroid (x, y), direction of the long axis, and with the eigenvalues
@@ -10,6 +12,9 @@ distance D for every height:
 
 and its area_mm is pixels times mm. In true mm, a pixel is Z / f wide, with the camera's focal
 length f and the distance Z = D - height_ave_mm of the animal.
+
+Syllables, a number per frame, are read from the results of keypoint-MoSeq (results.h5, its CSV
+tables, its moseq_df) and of MoSeq (the moseq_df.csv of moseq2-viz).
 """
 
 from pathlib import Path
@@ -20,6 +25,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from liex_lab.errors import LiexError, how_to_install, one_line
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.cutouts import open_depth, still_scene
@@ -133,3 +139,85 @@ def _middle_px(session: Session) -> Array:
         return np.full(2, np.nan)
     into = session.T_arena_camera.inverse()
     return session.camera.project(into @ np.array([*session.arena.centre_mm, 0.0]))
+
+
+# Syllables of MoSeq and keypoint-MoSeq, as labels of a session.
+
+
+MOSEQ = "moseq"
+_SYLLABLE = ("syllable", "labels (original)")  # columns of keypoint-MoSeq's and MoSeq's tables
+_OF = ("name", "SessionName")  # columns that name the recording
+
+
+def are_syllables(path: Path) -> bool:
+    """Whether a file is of a kind that syllables come in: HDF5, or CSV with a column of them."""
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        return True
+    try:
+        return path.suffix.lower() == ".csv" and bool({*_SYLLABLE} & {*pd.read_csv(path, nrows=0)})
+    except (OSError, ValueError):
+        return False
+
+
+def syllable_labels(path: Path, session: Session) -> pd.DataFrame:
+    """The syllables of a session as labels, named by their numbers: syllable_07.
+
+    Negative numbers, with which MoSeq fills frames without one, name nothing.
+
+    Args:
+        path: a file of `are_syllables`.
+        session: the session; a file of several recordings names it, as session.name.
+
+    Returns:
+        A table of action, start_s, stop_s (s since the first frame) and source.
+
+    Raises:
+        LiexError: the file cannot be read, or is not of this session, frame by frame.
+    """
+    try:
+        found = _syllables_of(path)
+    except ImportError as error:
+        raise LiexError(
+            f"to read {path}, {error.name} is missing; {how_to_install('exchange')}"
+        ) from None
+    except (OSError, ValueError, KeyError) as error:
+        raise LiexError(
+            f"{path} should be the results of keypoint-MoSeq (a syllable per frame of every "
+            f"recording) or a moseq_df.csv, but: {one_line(error)}"
+        ) from None
+    name = session.name if len(found) > 1 else next(iter(found), "")
+    time_s = session.frames["time_s"].to_numpy()
+    numbers = found.get(name, np.empty(0))
+    if len(numbers) != len(time_s):
+        raise LiexError(
+            f"{path} holds {len(numbers)} frames of {name} and the session {session.name} "
+            f"{len(time_s)}; syllables belong to frames, so give the results of what was exported "
+            f"from it (recordings in the file: {', '.join(list(found)[:5])})"
+        )
+    edges = np.flatnonzero(np.diff(numbers, prepend=np.nan, append=np.nan))
+    start, stop = edges[:-1], edges[1:]
+    labels = pd.DataFrame(
+        {
+            "action": [f"syllable_{int(number):02d}" for number in numbers[start]],
+            "start_s": time_s[start],
+            "stop_s": np.append(time_s, np.inf)[stop],
+            "source": MOSEQ,
+        }
+    )
+    return labels[numbers[start] >= 0]
+
+
+def _syllables_of(path: Path) -> dict[str, NDArray[np.int64]]:
+    """The syllable of every frame, -1 for none, by the recording's name."""
+    if path.suffix.lower() == ".csv":
+        table = pd.read_csv(path)
+        column = next(name for name in _SYLLABLE if name in table)
+        of = next((name for name in _OF if name in table), None)
+        parts = table.groupby(of, sort=False) if of else [(path.stem, table)]
+        found = {str(name): part[column].to_numpy(float) for name, part in parts}
+    else:
+        import h5py
+
+        with h5py.File(path, "r") as file:
+            found = {name: np.asarray(file[name]["syllable"][()], float) for name in file}
+    return {name: np.nan_to_num(one, nan=-1).astype(np.int64) for name, one in found.items()}

@@ -457,7 +457,7 @@ def delete_bout(session: Session, at_s: float) -> BoutEdit:
 
 
 def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
-    """Edits that replace the whole ethogram by a person's labels.
+    """Edits that replace the whole ethogram by labels of a person or of MoSeq.
 
     Time between the labels is cleared.
 
@@ -491,7 +491,11 @@ def labelled_bouts(session: Session, labels: Any) -> list[BoutEdit]:
         for a, b in zip(edges[::2], edges[1::2], strict=True)
         if a < b
     ]
-    return [*free, *(BoutEdit("add", bout.action, bout.start_ns, bout.stop_ns) for bout in bouts)]
+    source = labels["source"].iloc[0]
+    return [
+        *free,
+        *(BoutEdit("add", one.action, one.start_ns, one.stop_ns, source=source) for one in bouts),
+    ]
 
 
 def span_ns(session: Session, start_s: float, stop_s: float) -> tuple[int, int]:

@@ -24,6 +24,7 @@ from liex_lab.body.shape import BodyShape
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.exchange.boris import boris_export_labels, boris_labels, is_boris_export
+from liex_lab.exchange.moseq import are_syllables, syllable_labels
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.durable import replacing
@@ -483,12 +484,13 @@ def labelled_sessions(
     return tracks
 
 
-def read_any_labels(path: str | Path) -> pd.DataFrame:
-    """Labels from our table, a CSV, a BORIS project or BORIS's export of aggregated events.
+def read_any_labels(path: str | Path, session: Session | None = None) -> pd.DataFrame:
+    """Labels from our table, a CSV, BORIS (project, or aggregated events), or syllables of MoSeq.
 
     Args:
         path: the file; `.boris` and `.boris.gz` are projects; the format of a `.csv` or `.tsv` is
             detected from its content.
+        session: the session to label, which syllables need: they are of its frames.
 
     Returns:
         One row per bout.
@@ -499,6 +501,8 @@ def read_any_labels(path: str | Path) -> pd.DataFrame:
     source = Path(path)
     if not source.is_file():
         raise LiexError(f"there is no file of labels {source}; check the path")
+    if session is not None and are_syllables(source):
+        return syllable_labels(source, session)
     if source.name.endswith((".boris", ".boris.gz")):
         return boris_labels(source)
     if source.suffix in (".tsv", ".csv") and is_boris_export(source):

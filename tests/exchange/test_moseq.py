@@ -5,15 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
+import h5py
+import ndx_pose
 import numpy as np
 import pandas as pd
+import pynwb
 import pytest
+from liex_lab.pipelines.correct import edited_bouts
 from liex_lab.pipelines.session import run_session
+from liex_lab.pipelines.training.action_model import read_any_labels
 
+from liex_lab.errors import LiexError
 from liex_lab.exchange.export import export
 from liex_lab.exchange.moseq import scalars_moseq
 from liex_lab.recordings.open import open_recording
 from liex_lab.sessions import Session
+from liex_lab.sessions.correcting import labelled_bouts
 from tests.recordings.moseq_results import write_results
 
 EIGHTEEN = {
@@ -99,3 +106,73 @@ def test_a_real_study_measured_again_agrees_with_its_frames_and_with_moseq(
             assert np.median(np.abs(found[ours] / truth[theirs] - 1)) < most * more, ours
     mm = found["centroid_x_mm"] - truth["centroid_x_mm"]
     assert np.median(np.abs(mm)) < 0.3
+
+
+def test_keypoint_moseq_reads_the_nwb_file_in_3d(session: Session, tmp_path: Path) -> None:
+    """As its loader does: the one PoseEstimation, and a series with a confidence for each node."""
+    with pynwb.NWBHDF5IO(export(session, "nwb", tmp_path), "r", load_namespaces=True) as file:
+        (found,) = (
+            one for one in file.read().all_children() if isinstance(one, ndx_pose.PoseEstimation)
+        )
+        series = [found.pose_estimation_series[name] for name in found.nodes[:]]
+        xyz = np.stack([one.data[()] for one in series], axis=1)
+        confidence = np.stack([one.confidence[()] for one in series], axis=1)
+    np.testing.assert_allclose(xyz, session.pose_arrays().xyz_mm, atol=1e-3)
+    assert 0 <= np.nanmin(confidence) <= np.nanmax(confidence) <= 1
+
+
+def _syllables(session: Session) -> np.ndarray:
+    rng = np.random.default_rng(5)
+    return np.repeat(rng.integers(0, 12, 40), rng.integers(2, 9, 40))[: len(session.frames)]
+
+
+def _results(path: Path, **recordings: np.ndarray) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, syllables in recordings.items():
+            file[f"{name}/syllable"] = syllables
+            file[f"{name}/heading"] = np.zeros(len(syllables))
+    return path
+
+
+def test_syllables_become_the_bouts_of_a_session(session: Session, tmp_path: Path) -> None:
+    numbers = _syllables(session)
+    other = _results(tmp_path / "results.h5", **{session.name: numbers, "other": numbers[:9]})
+    table = pd.DataFrame({"syllable": numbers, "heading": 0.0})
+    table.to_csv(tmp_path / f"{session.name}.csv", index=False)
+    named = table.assign(name=session.name, frame_index=range(len(table)))
+    named.to_csv(tmp_path / "kpms_df.csv", index=False)
+    for file in (other, tmp_path / f"{session.name}.csv", tmp_path / "kpms_df.csv"):
+        edits = labelled_bouts(session, read_any_labels(file, session))
+        bouts = edited_bouts(session.bouts, edits, session.frames)
+        assert set(bouts["source"]) == {"moseq"}
+        words = np.full(len(numbers), "", object)
+        index = session.frames["frame_index"].to_numpy()
+        for bout in bouts.itertuples():
+            words[(index >= bout.start_frame) & (index < bout.stop_frame)] = bout.action
+        assert words.tolist() == [f"syllable_{number:02d}" for number in numbers]
+
+
+def test_frames_without_a_syllable_have_no_name(session: Session, tmp_path: Path) -> None:
+    numbers = _syllables(session)
+    numbers[:3] = -5  # as MoSeq fills the lags of its model
+    table = pd.DataFrame({"labels (original)": numbers, "SessionName": "a day"})
+    table.to_csv(tmp_path / "moseq_df.csv", index=False)
+    labels = read_any_labels(tmp_path / "moseq_df.csv", session)
+    assert labels["start_s"].min() == session.frames["time_s"][3]
+
+
+def test_syllables_of_other_frames_are_refused(session: Session, tmp_path: Path) -> None:
+    numbers = _syllables(session)
+    short = _results(tmp_path / "results.h5", any=numbers[1:])
+    with pytest.raises(LiexError, match="syllables belong to frames"):
+        read_any_labels(short, session)
+    absent = _results(tmp_path / "results.h5", one=numbers, two=numbers)
+    with pytest.raises(LiexError, match=r"holds 0 frames of .*recordings in the file: one, two"):
+        read_any_labels(absent, session)
+    with h5py.File(tmp_path / "results.h5", "w") as file:
+        file["frames"] = np.zeros(3)
+    for content in (None, b"no HDF5"):
+        if content:
+            (tmp_path / "results.h5").write_bytes(content)
+        with pytest.raises(LiexError, match="should be the results of keypoint-MoSeq"):
+            read_any_labels(tmp_path / "results.h5", session)
