@@ -54,7 +54,7 @@ def test_frames_come_out_where_the_animal_was(file: Path) -> None:
         assert recording.camera.source == "typical Kinect v2"
         np.testing.assert_allclose(np.diff(recording.times_ns) / 1e6, np.diff(_TIMES), atol=1e-3)
         assert any("typical Kinect v2 were taken" in one for one in recording.problems)
-        assert any("10 to 100 mm within 80 px" in one for one in recording.problems)
+        assert any("10 to 100 mm in a square of 80 px" in one for one in recording.problems)
         assert not recording.doubts
         for frame, truth in zip(recording, _FRAMES, strict=True):
             true, found = (_background() - one >= 10 for one in (truth, frame.depth))
@@ -147,3 +147,14 @@ def test_a_cut_file_and_one_that_is_no_hdf5_are_refused(file: Path, share: float
     file.write_bytes(content[: int(share * len(content))] or b"no HDF5")
     with pytest.raises(RecordingError, match="should be the results of moseq2-extract"):
         open_recording(file)
+
+
+def test_a_damaged_block_is_unread_and_reported_once(file: Path) -> None:
+    with h5py.File(file) as opened:
+        at = opened["frames"].id.get_chunk_info(0).byte_offset
+    content = bytearray(file.read_bytes())
+    content[at + 8 : at + 24] = bytes(16)
+    file.write_bytes(content)
+    with open_recording(file) as recording:
+        assert all((frame.depth == 0).all() for frame in recording)
+        assert sum("taken as wholly unread" in one for one in recording.problems) == 1

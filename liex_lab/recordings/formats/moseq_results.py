@@ -37,7 +37,7 @@ from liex_lab.recordings.formats.moseq import (
     assumed_camera,
     stated_in,
 )
-from liex_lab.recordings.frame import Depth, unread_where_damaged
+from liex_lab.recordings.frame import Depth
 from liex_lab.recordings.recording import Recording, closing_on_error
 from liex_lab.recordings.timestamp_files import UNITS, Stamps
 from liex_lab.recordings.timestamps import (
@@ -106,7 +106,7 @@ def open_results(
                 path, (width, height), metadata.camera or KINECT, metadata, problems
             ),
             times_ns=monotone.times_ns,
-            read=unread_where_damaged(results.read, (height, width), problems),
+            read=results.read,
             sources=[path],
             problems=problems,
             close=file.close,
@@ -128,7 +128,8 @@ class _Results:
         self._path = path
         self._file = file
         self._lock = Lock()
-        self._block: tuple[int, NDArray[Any]] = (-1, np.empty(0))
+        self._block: tuple[int, NDArray[Any] | None] = (-1, None)
+        self._problems = problems
         frames: Any = file.get("frames")
         if getattr(frames, "ndim", 0) != 3 or frames.dtype.kind not in "ui" or not len(frames):
             raise RecordingError(
@@ -142,17 +143,17 @@ class _Results:
                 f"{path} holds cut-outs of {frames.shape[2]} x {frames.shape[1]} pixels, and how "
                 "MoSeq turns any but squares is not known; extract it again with a square crop-size"
             )
-        self._n_rows = max(_BLOCK, (frames.chunks or (1,))[0])
+        chunk = (frames.chunks or (1,))[0]
+        self._n_rows = chunk * max(1, _BLOCK // chunk)
         self._background(problems)
         self._places(problems)
         low, high = (_number(file, f"{_PARAMETERS}{end}_height") for end in ("min", "max"))
         self._low = 10.0 if low is None else low
         high = 100.0 if high is None else high
         problems.append(
-            f"MoSeq keeps heights of {self._low:g} to {high:g} mm within {self.side} px, so frames "
-            "were put together again without what is lower (most of the tail, paws), higher "
-            "(unread here) or farther from the animal, and background does not change; joints there"
-            " are guesses"
+            f"MoSeq keeps heights of {self._low:g} to {high:g} mm in a square of {self.side} px "
+            "about the animal; what is lower (most of the tail, paws), higher (unread here) or "
+            "farther away is lost, joints there are extrapolated, and the background never changes"
         )
 
     def _background(self, problems: list[str]) -> None:
@@ -223,15 +224,14 @@ class _Results:
         known = {"moseq_corner_px": self.corner.tolist(), "moseq_floor_mm": self.floor_mm}
         return {name: value for name, value in known.items() if value is not None}
 
-    def read(self, index: int) -> Depth | str:
-        """Depth (H, W) float32 mm of a frame, or what is wrong with it."""
+    def read(self, index: int) -> Depth:
+        """Depth (H, W) float32 mm of a frame, wholly unread where the file is damaged."""
         depth = self.scene.copy()
         if not self.known[index]:
             return depth
-        try:
-            cut = self._cut_out(index)
-        except OSError as error:
-            return f" ({one_line(error)}) is damaged"
+        cut = self._cut_out(index)
+        if cut is None:
+            return np.zeros_like(depth)
         height, is_animal, is_hole = self._turned_back(cut, index)
         left, top = self._from[index]
         rows = slice(max(0, top), max(0, top + self.side))
@@ -258,14 +258,24 @@ class _Results:
         height = np.rint(height / np.maximum(share, 0.5))
         return height, is_animal, binary_fill_holes(is_animal) & ~is_animal
 
-    def _cut_out(self, index: int) -> NDArray[Any]:
-        """A cut-out as it was before it was flipped; reads a block of frames at a time."""
+    def _cut_out(self, index: int) -> NDArray[Any] | None:
+        """A cut-out as it was before it was flipped; None if the block of frames is damaged."""
         at = index - index % self._n_rows
         with self._lock:
             if self._block[0] != at:
-                self._block = at, self.frames[at : at + self._n_rows]
-            cut = self._block[1][index - at]
-        return cut[::-1, ::-1] if self._flips[index] else cut
+                try:
+                    self._block = at, self.frames[at : at + self._n_rows]
+                except OSError as error:
+                    self._block = at, None
+                    sentence = (
+                        f"the {self._n_rows} frames from {at} on are damaged "
+                        f"({one_line(error)}), and were taken as wholly unread"
+                    )
+                    self._problems += [sentence] * (sentence not in self._problems)
+            block = self._block[1]
+        if block is None:
+            return None
+        return block[index - at, ::-1, ::-1] if self._flips[index] else block[index - at]
 
     def check_first_frame(self, doubts: list[str]) -> None:
         """Compare the first frame, put together again, with the raw one that the file holds."""
@@ -273,7 +283,7 @@ class _Results:
         raw = None if raw is None else np.squeeze(raw)
         trim = _array(self._file, f"{_PARAMETERS}frame_trim")
         frame = self.read(0)
-        if raw is None or raw.shape != self.scene.shape or isinstance(frame, str):
+        if raw is None or raw.shape != self.scene.shape:
             doubts.append(
                 "the file holds no raw first frame, with which frames put together again could be "
                 "compared; check the replay before you trust them"
