@@ -35,7 +35,14 @@ from liex_lab.scene import (
 )
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.scene import UNKNOWN, Arena, find_arena, plane_of
-from liex_lab.scene.zones import Corners, DrawnZone, Zone, read_zones, region_corners_px
+from liex_lab.scene.zones import (
+    Corners,
+    DrawnZone,
+    Zone,
+    joint_of,
+    read_zones,
+    region_corners_px,
+)
 from liex_lab.sessions import Provenance, cutouts
 from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.own_shape import StatedShape
@@ -141,16 +148,20 @@ def build_arena(scene: height_maps.Segmenter, plan: Plan) -> tuple[Arena, tuple[
     arena = UNKNOWN
     if isinstance(scene, background_segmenter.BackgroundSubtraction):
         arena = find_arena(scene.background, scene.floor.for_camera(scene.grid), scene.grid)
-    return arena, tuple(zone.placed(scene.camera, scene.floor, arena) for zone in build_zones(plan))
+    placed = (drawn.placed(scene.camera, scene.floor, arena) for drawn in build_zones(plan))
+    return arena, tuple(zone for zones in placed for zone in zones)
 
 
 def build_zones(plan: Plan) -> tuple[DrawnZone, ...]:
     """The zones of the plan as drawn; () if it names none.
 
     Raises:
-        PlanError: the file of zones cannot be used.
+        PlanError: the file of zones cannot be used, or names a part that the animal lacks.
     """
-    return read_zones(plan.arena.zones) if plan.arena.zones else ()
+    zones = read_zones(plan.arena.zones) if plan.arena.zones else ()
+    for part in {zone.body_part for zone in zones} - {None}:
+        joint_of(str(part), Skeleton.load(animal_of(plan).skeleton).names)
+    return zones
 
 
 def build_surroundings(provenance: Provenance) -> activity.Surroundings:

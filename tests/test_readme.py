@@ -120,9 +120,12 @@ def test_every_column_that_is_named_is_one() -> None:
 
 
 def test_the_zones_can_be_read(tmp_path: Path) -> None:
-    (example,) = blocks("toml", PAGES["howto/zones.md"])
-    (tmp_path / "zones.toml").write_text(example, encoding="utf-8")
-    assert [zone.name for zone in read_zones(tmp_path / "zones.toml")] == ["centre", "nest"]
+    names = []
+    for example in blocks("toml", PAGES["howto/zones.md"]):
+        (tmp_path / "zones.toml").write_text(example, encoding="utf-8")
+        names.append([name for zone in read_zones(tmp_path / "zones.toml") for name in zone.names])
+    corners = [f"corner_{k}" for k in range(1, 5)]
+    assert names == [["centre", "nest"], ["centre", "periphery", *corners, "left_object"]]
 
 
 def test_the_animal_of_ones_own_can_be_read(tmp_path: Path) -> None:

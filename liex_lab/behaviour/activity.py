@@ -33,7 +33,9 @@ BIN_S = 60.0
 FEWEST = 10  # bins, of a shorter recording
 
 
-def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]) -> pd.DataFrame:
+def activity(
+    kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str], bin_s: float = 0.0
+) -> pd.DataFrame:
     """The table `activity` of one animal: one row per time bin.
 
     A frame counts in the bin in which it begins.
@@ -42,9 +44,10 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
         kinematics: the table `kinematics`.
         bouts: the table `bouts`, in order of time.
         words: the actions' names.
+        bin_s: length of a bin, s; 0 is a minute, or a tenth of less than ten minutes.
     """
     time_s = kinematics["time_s"].to_numpy(float)
-    edges = intervals(float(stop_times(time_s)[-1]))
+    edges = intervals(float(stop_times(time_s)[-1]), bin_s)
     row = np.clip(np.searchsorted(edges, time_s, side="right") - 1, 0, len(edges) - 2)
     hold = observed_hold(kinematics)
     step = kinematics["step_mm"].to_numpy(float)
@@ -73,14 +76,14 @@ def activity(kinematics: pd.DataFrame, bouts: pd.DataFrame, words: Sequence[str]
     )
 
 
-def intervals(duration_s: float) -> Array:
+def intervals(duration_s: float, bin_s: float = 0.0) -> Array:
     """Edges (k + 1,) of the bins of a recording, s: whole minutes, the last one possibly shorter.
 
-    Less than ten minutes are divided into tenths.
+    Less than ten minutes are divided into tenths, unless `bin_s` states the length.
     """
-    if duration_s < FEWEST * BIN_S:
+    if not bin_s and duration_s < FEWEST * BIN_S:
         return np.linspace(0.0, duration_s, FEWEST + 1)
-    return np.append(np.arange(0.0, duration_s - 1e-9, BIN_S), duration_s)
+    return np.append(np.arange(0.0, duration_s - 1e-9, bin_s or BIN_S), duration_s)
 
 
 def observed_hold(kinematics: pd.DataFrame) -> Array:

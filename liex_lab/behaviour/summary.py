@@ -176,7 +176,7 @@ def measure(
         named,
         summarise(frames, moved, named, words, around, rules),
         transitions(named, words.words, gaps, rules.merge_pauses_s),
-        activity(moved, named, words.words),
+        activity(moved, named, words.words, rules.bin_s),
         visits(frames, moved, words.zones, rules),
         rules,
         words,

@@ -538,6 +538,18 @@ class BehaviourThresholds(SettingsTable):
         0.33, description="shorter interruptions of a bout are bridged"
     )
     min_bout_s: NotNegative = Field(0.23, description="shorter bouts are dropped, after bridging")
+    bin_s: NotNegative = Field(
+        0.0,
+        description="length of the bins of the table activity; 0 is a minute, or a tenth of a "
+        "recording of less than ten minutes",
+    )
+
+    @field_validator("bin_s")
+    @classmethod
+    def _is_long_enough(cls, value: float) -> float:
+        if 0.0 < value < 1.0:
+            raise ValueError("should be 0 or at least 1 s")
+        return value
 
 
 class LightSettings(SettingsTable):

@@ -4,9 +4,11 @@ A region is a polygon, rectangle or circle of a plan, in pixels or in millimetre
 frame: x along image rows and y up the image. Corners in millimetres are projected from the floor
 into the image. Overlapping arenas are refused.
 
-Zones are named circles and polygons from TOML. A point is inside a polygon by the even-odd rule:
-the number of sides that a ray along x crosses. Zones may be drawn in pixels; the view rays of their
-outline are intersected with the floor, 1 / z = a u + b v + c.
+Zones are named circles and polygons from TOML, or of a kind: centre and periphery, corners, and
+objects with a margin. A point is inside a polygon by the even-odd rule: the number of sides that a
+ray along x crosses; the periphery is a polygon whose outline turns back around the centre. Zones
+may be drawn in pixels; the view rays of their outline are intersected with the floor, 1 / z = a u +
+b v + c.
 """
 
 import difflib
@@ -139,6 +141,9 @@ def masks_apart(regions: Mapping[str, Corners], width: int, height: int) -> dict
 # Zones on the floor.
 
 SEPARATOR = ";"  # between the names of zones that overlap, in tables
+# joints that a part of the body may be, the first that the animal has
+PARTS = {"nose": ("nose", "head"), "tail_base": ("tail_base", "rump")}
+Part = Literal["centre", "nose", "tail_base"]
 _EXAMPLE = '[[zones]], name = "centre", circle = { centre = [0, 0], radius = 80 }'
 
 
@@ -150,11 +155,13 @@ class Zone:
         name: of the zone; columns are named after it.
         circle_mm: x, y and radius, mm; None for a polygon.
         polygon_mm: corners (x, y), mm; None for a circle.
+        part: of the animal that is in it, a key of `PARTS`; None for its centre.
     """
 
     name: str
     circle_mm: tuple[float, float, float] | None = None
     polygon_mm: tuple[tuple[float, float], ...] | None = None
+    part: str | None = None
 
     def contains(self, xy_mm: ArrayLike) -> NDArray[np.bool_]:
         """Whether points lie in the zone.
@@ -195,43 +202,89 @@ class Zone:
         return TypeAdapter(Zone).validate_python(numbers)
 
 
-def zone_names(zones: Sequence[Zone], xy_mm: ArrayLike) -> list[str]:
-    """The names of the zones that contain each point.
+def zone_names(
+    zones: Sequence[Zone], xy_mm: ArrayLike, parts: Mapping[str, ArrayLike] | None = None
+) -> list[str]:
+    """The names of the zones that contain the animal in each frame.
 
     Args:
         zones: the zones, which may overlap.
-        xy_mm: (n, 2) points, mm, arena frame.
+        xy_mm: (n, 2) its centre, mm, arena frame.
+        parts: (n, 2) of its other parts that zones name.
 
     Returns:
         n strings, names joined by `SEPARATOR`; '' for none.
     """
     xy = np.asarray(xy_mm, float)
-    inside = [(zone.name, zone.contains(xy)) for zone in zones]
+    places = {None: xy, **(parts or {})}
+    inside = [(zone.name, zone.contains(places[zone.part])) for zone in zones]
     return [SEPARATOR.join(name for name, is_in in inside if is_in[k]) for k in range(len(xy))]
 
 
+class ObjectPoint(SettingsTable):
+    """A point and a margin, see `DrawnZone.object`."""
+
+    at: Corner
+    margin: Annotated[float, Field(gt=0)]
+
+
+def joint_of(part: str, joints: Sequence[str]) -> int:
+    """Number of the joint that is a part of the body.
+
+    Args:
+        part: a key of `PARTS`.
+        joints: names of the animal's joints.
+
+    Raises:
+        PlanError: the animal has no such part.
+    """
+    for name in PARTS[part]:
+        if name in joints:
+            return list(joints).index(name)
+    raise PlanError(
+        f"arena.zones: this animal has no {' or '.join(PARTS[part])} among its joints "
+        f"({', '.join(joints[:6])}), which part = '{part}' needs; leave part out"
+    )
+
+
 class DrawnZone(SettingsTable):
-    """A zone as stated in a file: a circle or a polygon.
+    """A zone as stated in a file: a circle, a polygon, or one of a kind.
 
     Attributes:
-        name: of the zone; columns are named after it.
+        name: of the zone; columns are named after it. Not of the kinds 'centre_periphery' and
+            'corners', which name their own.
         circle: its centre and radius, in `unit`.
         polygon: its corners, in `unit`.
+        kind: 'centre_periphery' and 'corners' are made of the detected arena.
+        object: a point and the radius around it that counts, in `unit`; the nose visits it unless
+            another part is stated.
+        part: of the animal that is in the zone, 'centre', 'nose' or 'tail_base'.
+        share: of 'centre_periphery': the centre's width over the arena's.
+        size: of 'corners': their side, mm.
         unit: 'mm' of the arena frame, or 'px' of the depth image.
         relative_to: 'centre' for coordinates relative to the arena's centre and rotation; None
             otherwise.
     """
 
-    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    name: str = Field("", pattern=r"^([A-Za-z][A-Za-z0-9_]*)?$")
     circle: Circle | None = None
     polygon: Annotated[list[Corner], Field(min_length=3)] | None = None
+    kind: Literal["centre_periphery", "corners"] | None = None
+    object: ObjectPoint | None = None
+    part: Part | None = None
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    size: Annotated[float, Field(gt=0)] = 100.0
     unit: Literal["mm", "px"] = "mm"
     relative_to: Literal["centre"] | None = None
 
     @model_validator(mode="after")
     def _is_drawn(self) -> Self:
-        if (self.circle is None) == (self.polygon is None):
-            raise ValueError("should have either a circle or a polygon")
+        if [self.circle, self.polygon, self.kind, self.object].count(None) != 3:
+            raise ValueError("should have either a circle or a polygon, a kind or an object")
+        if self.kind is None and not self.name:
+            raise ValueError("name is missing")
+        if self.kind is not None and (self.name or self.unit == "px" or self.relative_to):
+            raise ValueError("should have no name, unit or relative_to beside its kind")
         if self.unit == "px" and self.relative_to:
             raise ValueError('should have relative_to only with unit = "mm"')
         corners = np.array(self.polygon or [[0, 0], [1, 0], [0, 1]], float)
@@ -245,24 +298,48 @@ class DrawnZone(SettingsTable):
             )
         return self
 
-    def placed(self, camera: Camera, floor: Floor, arena: Arena) -> Zone:
-        """The zone in the arena frame, mm.
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the zones that it makes."""
+        of_kind = {
+            "centre_periphery": ("centre", "periphery"),
+            "corners": tuple(f"corner_{k}" for k in range(1, 5)),
+        }
+        return of_kind[self.kind] if self.kind else (self.name,)
+
+    @property
+    def body_part(self) -> str | None:
+        """The part of the animal, as in `Zone.part`."""
+        part = self.part or ("nose" if self.object else "centre")
+        return None if part == "centre" else part
+
+    def placed(self, camera: Camera, floor: Floor, arena: Arena) -> tuple[Zone, ...]:
+        """The zones in the arena frame, mm.
 
         A circle in pixels becomes a polygon of 64 corners, as it is no circle on a tilted floor.
 
         Args:
             camera: of the pixels of a zone in px.
             floor: the floor's plane.
-            arena: the detected outline, for zones relative to its centre.
+            arena: the detected outline, for zones relative to its centre or made of it.
 
         Raises:
-            PlanError: the zone is drawn above the floor's horizon, or relative to the centre of an
-                arena whose walls were not found.
+            PlanError: the zone is drawn above the floor's horizon, relative to the centre of an
+                arena whose walls were not found, or at corners that it does not have.
         """
-        points = np.array([self.circle.centre] if self.circle else self.polygon, float)
+        if self.kind is not None:
+            outlines = self._of_arena(arena)
+            return tuple(
+                Zone(name, polygon_mm=_pairs(outline), part=self.body_part)
+                for name, outline in zip(self.names, outlines, strict=True)
+            )
+        circle = self.circle
+        if self.object is not None:
+            circle = Circle(centre=self.object.at, radius=self.object.margin)
+        points = np.array([circle.centre] if circle else self.polygon, float)
         if self.unit == "px":
-            if self.circle:
-                points = points + self.circle.radius * circle_points(64)
+            if circle:
+                points = points + circle.radius * circle_points(64)
             inverse = floor.inverse_at(points[:, 0], points[:, 1])
             if not (inverse > 0).all():
                 raise PlanError(
@@ -270,19 +347,42 @@ class DrawnZone(SettingsTable):
                     "draw it on the floor"
                 )
             on_floor = floor.T_arena_camera @ camera.unproject(points, 1.0 / inverse)
-            return Zone(self.name, polygon_mm=_pairs(on_floor[:, :2]))
+            return (Zone(self.name, polygon_mm=_pairs(on_floor[:, :2]), part=self.body_part),)
         if self.relative_to is not None:
-            if arena.centre_mm is None:
-                raise PlanError(
-                    f"arena.zones: the zone '{self.name}' is relative to the arena's centre, but "
-                    "no walls were found; omit relative_to"
-                )
             c = np.cos(arena.yaw_rad or 0.0)
             s = np.sin(arena.yaw_rad or 0.0)
-            points = points @ np.array([[c, s], [-s, c]]) + np.array(arena.centre_mm)
-        if self.circle is None:
-            return Zone(self.name, polygon_mm=_pairs(points))
-        return Zone(self.name, circle_mm=(*_pairs(points)[0], self.circle.radius))
+            points = points @ np.array([[c, s], [-s, c]]) + self._centre_of(arena)
+        if circle is None:
+            return (Zone(self.name, polygon_mm=_pairs(points), part=self.body_part),)
+        return (Zone(self.name, (*_pairs(points)[0], circle.radius), part=self.body_part),)
+
+    def _centre_of(self, arena: Arena) -> Array:
+        """The middle (2,) of the detected arena, mm."""
+        if arena.centre_mm is None:
+            raise PlanError(
+                f"arena.zones: the zone '{self.names[0]}' is relative to the arena's centre, but "
+                "no walls were found; omit relative_to, or draw it instead of its kind"
+            )
+        return np.array(arena.centre_mm)
+
+    def _of_arena(self, arena: Arena) -> list[Array]:
+        """The outlines of the zones of a kind, mm."""
+        centre, outer = self._centre_of(arena), arena.outline_mm()
+        if self.kind == "centre_periphery":
+            inner = centre + self.share * (outer - centre)
+            ring = np.concatenate([outer, outer[:1], inner, inner[:1]])
+            return [inner, ring]
+        if arena.half_mm is None:
+            raise PlanError(
+                "arena.zones: corners are those of a rectangular arena, but this one is "
+                f"{arena.kind}; draw the zones instead"
+            )
+        squares = []
+        for k in range(4):
+            sides = np.stack([outer[(k + 1) % 4], outer[k - 1]]) - outer[k]
+            a, b = self.size * sides / np.linalg.norm(sides, axis=1, keepdims=True)
+            squares.append(outer[k] + np.array([0.0 * a, a, a + b, b]))
+        return squares
 
 
 class _ZonesFile(SettingsTable):
@@ -292,7 +392,7 @@ class _ZonesFile(SettingsTable):
 
     @model_validator(mode="after")
     def _are_named(self) -> Self:
-        names = [zone.name for zone in self.zones]
+        names = [name for zone in self.zones for name in zone.names]
         if double := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(f"has two zones called '{double}'; give each a name of its own")
         return self

@@ -24,7 +24,7 @@ from liex_lab.recordings.timestamps import Gap, frames_apart, rounded_step
 from liex_lab.recordings.timestamps import median_step as recorded_step
 from liex_lab.runtime.memory import blocks
 from liex_lab.scene.scene import UNKNOWN, Arena
-from liex_lab.scene.zones import Zone, zone_names
+from liex_lab.scene.zones import Zone, joint_of, zone_names
 from liex_lab.tables.schema import (
     BOUTS,
     FRAMES,
@@ -140,11 +140,14 @@ class Rows:
         wall = np.empty(self.track.n_frames)
         codes = np.empty(self.track.n_frames, np.int64)
         known: dict[str, int] = {}
+        names = self.track.skeleton.names
+        joints = {one: joint_of(one, names) for zone in self.zones if (one := zone.part)}
         for part in self._parts(1):
             xy = self.track.centroid_mm[part, :2]
             wall[part] = self.arena.wall_distance_mm(xy)
+            parts = {one: self.track.joints_mm[part, at, :2] for one, at in joints.items()}
             codes[part] = [
-                known.setdefault(name, len(known)) for name in zone_names(self.zones, xy)
+                known.setdefault(name, len(known)) for name in zone_names(self.zones, xy, parts)
             ]
         return wall, pa.DictionaryArray.from_arrays(codes, list(known))
 

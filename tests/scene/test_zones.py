@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from liex_lab.behaviour.activity import intervals
 from liex_lab.errors import PlanError
 from liex_lab.optics.camera import Camera
+from liex_lab.plan import Plan
 from liex_lab.scene.floor import Floor
 from liex_lab.scene.scene import Arena
-from liex_lab.scene.zones import Zone, read_zones, zone_names
+from liex_lab.scene.zones import Zone, joint_of, read_zones, zone_names
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 FLOOR = Floor.from_plane(np.array([0.1, -0.05, 1.0]), 700.0, CAMERA)
@@ -22,7 +24,8 @@ corners = st.lists(st.tuples(st.floats(-100, 100), st.floats(-100, 100)), min_si
 def zones(folder: Path, text: str, arena: Arena = ROOM) -> tuple[Zone, ...]:
     path = folder / "zones.toml"
     path.write_text(text, encoding="utf-8")
-    return tuple(zone.placed(CAMERA, FLOOR, arena) for zone in read_zones(path))
+    drawn = read_zones(path)
+    return tuple(zone for one in drawn for zone in one.placed(CAMERA, FLOOR, arena))
 
 
 def test_circles_and_polygons_hold_what_is_in_them(tmp_path: Path) -> None:
@@ -162,3 +165,54 @@ def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
         read_zones(tmp_path / "none.toml")
     with pytest.raises(PlanError, match="should be a TOML"):
         read_zones(tmp_path)
+
+
+def test_the_nose_may_be_in_a_zone_that_the_body_is_not_in() -> None:
+    at_object = Zone("object", (0.0, 0.0, 20.0), part="nose")
+    around = Zone("around", (0.0, 0.0, 60.0))
+    body, nose = (
+        [[50.0, 0.0], [50.0, 0.0], [5.0, 0.0]],
+        [[15.0, 0.0], [np.nan, np.nan], [40.0, 0.0]],
+    )
+    names = zone_names([at_object, around], body, {"nose": nose})
+    assert names == ["object;around", "around", "around"]
+    assert Zone.from_dict(at_object.to_dict()) == at_object
+    assert "part" not in around.to_dict(), "sessions without parts are as before"
+
+
+def test_centre_and_periphery_share_the_arena(tmp_path: Path) -> None:
+    for arena in (ROOM, Arena("round", (10.0, 20.0), 150.0)):
+        centre, periphery = zones(tmp_path, "[[zones]]\nkind = 'centre_periphery'", arena)
+        assert (centre.name, periphery.name) == ("centre", "periphery")
+        points = np.random.default_rng(0).uniform(-300.0, 300.0, (4000, 2))
+        inside = arena.wall_distance_mm(points) > 0.5
+        both = np.stack([centre.contains(points), periphery.contains(points)])
+        assert (both.sum(axis=0)[inside] == 1).all()
+        assert not both[:, arena.wall_distance_mm(points) < -0.5].any()
+        assert both[0].sum() / inside.sum() == pytest.approx(0.25, abs=0.04)
+
+
+def test_corners_are_the_four_squares_of_a_rectangular_arena(tmp_path: Path) -> None:
+    corners = zones(tmp_path, "[[zones]]\nkind = 'corners'\nsize = 60")
+    assert [zone.name for zone in corners] == [f"corner_{k}" for k in range(1, 5)]
+    for zone in corners:
+        sides = np.linalg.norm(np.diff(zone.outline_mm(), axis=0), axis=1)
+        np.testing.assert_allclose(sides, 60.0)
+        assert ROOM.wall_distance_mm(zone.outline_mm()).min() == pytest.approx(0.0, abs=1e-6)
+    with pytest.raises(PlanError, match="rectangular arena, but this one is round"):
+        zones(tmp_path, "[[zones]]\nkind = 'corners'", Arena("round", (0.0, 0.0), 150.0))
+
+
+def test_an_object_is_visited_by_the_nose(tmp_path: Path) -> None:
+    text = "[[zones]]\nname = 'ball'\nobject = { at = [30, 40], margin = 25 }"
+    assert zones(tmp_path, text) == (Zone("ball", (30.0, 40.0, 25.0), part="nose"),)
+    assert zones(tmp_path, f"{text}\npart = 'centre'") == (Zone("ball", (30.0, 40.0, 25.0)),)
+    with pytest.raises(PlanError, match="has no tail_base or rump among its joints"):
+        joint_of("tail_base", ("head", "tail_tip"))
+
+
+def test_bins_of_one_s_own_length_cover_the_recording() -> None:
+    np.testing.assert_allclose(intervals(65.0, 20.0), [0.0, 20.0, 40.0, 60.0, 65.0])
+    assert len(intervals(65.0)) == 11
+    with pytest.raises(PlanError, match="at least 1 s"):
+        Plan().with_settings(["behaviour.bin_s=0.01"])
