@@ -14,7 +14,7 @@ import threading
 import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +173,8 @@ class StatedRegions:
         Returns:
             places (name, title, file, stated), place (the name of the one that applies), region
             (corners, px; None if none is stated), message (why it cannot be displayed), recording
-            (its name in commands), has_recording (whether its whole image is available).
+            (its name in commands), has_recording (whether its whole image is available), zones
+            (name, part, corners of the zones drawn in pixels).
 
         Raises:
             LiexError: there is no such recording, or the study cannot be read.
@@ -193,6 +194,11 @@ class StatedRegions:
             "place": counts.name,
             "region": corners,
             "message": message,
+            "zones": [
+                {"name": zone.name, "part": zone.part or "centre", "corners": zone.polygon}
+                for zone in self._zones(key, session)[0]
+                if zone.unit == "px" and zone.polygon
+            ],
             "recording": self._recording(key, session),
             "has_recording": self._study is not None and self._planned(key)[1].recording_exists,
         }
@@ -250,10 +256,87 @@ class StatedRegions:
                     "the lines below into it yourself, or free the place"
                 ) from None
         done = "states this region" if value is not None else "states no region any more"
-        command = f"liex run {self._recording(key, session)} --plan {shlex.quote(str(found.file))}"
+        return f"{found.file.name} {done}; measure again: {self._again(key, session, found)}"
+
+    def _again(self, key: str, session: Session | None, place: Place) -> str:
+        """The command that measures again what a place applies to."""
         if self._study is not None:
-            command = f"liex cohort {shlex.quote(str(self._study))}"
-        return f"{found.file.name} {done}; measure again: {command}"
+            return f"liex cohort {shlex.quote(str(self._study))}"
+        return f"liex run {self._recording(key, session)} --plan {shlex.quote(str(place.file))}"
+
+    def save_zone(
+        self, key: str, session: Session | None, name: str, part: str, corners: Any
+    ) -> str:
+        """Add a zone to the file of zones, or replace or remove the one of its name.
+
+        A file that does not exist is made, and stated as arena.zones for all recordings that share
+        the plan. The other zones and comments of the file stay.
+
+        Args:
+            key: the recording's name in the study.
+            session: its results; None if it was not measured.
+            name: of the zone.
+            part: of the animal that counts, see `scene.zones.Part`.
+            corners: (u, v) px; None removes the zone.
+
+        Returns:
+            A message on the change and the next command.
+
+        Raises:
+            LiexError: the zone is not valid, or a file cannot be changed.
+        """
+        import tomlkit
+
+        with self._lock:
+            _, file, place = self._zones(key, session)
+            if corners is not None:
+                corners = self._checked(key, session, corners)
+            text = text_files.decoded(file.read_bytes()) if file.is_file() else ""
+            document = tomlkit.parse(text)
+            drawn = document.setdefault("zones", tomlkit.aot())
+            same = [k for k, one in enumerate(drawn) if one.get("name") == name]
+            for k in reversed(same):
+                del drawn[k]
+            if corners is not None:
+                part_of = {} if part == "centre" else {"part": part}
+                zone = {"name": name, "unit": "px", "polygon": corners} | part_of
+                drawn.append(tomlkit.item(zone))
+            if any_left := len(drawn) > 0:
+                zones.zones_of(text_files.parse_toml(tomlkit.dumps(document)), file.name)
+            else:
+                del document["zones"]
+            stated = str(file.resolve() if self._study is None else file.name)
+            plan_text = with_value(
+                self._text(place, session),
+                place.path,
+                (place.stated or stated) if any_left else None,
+                place.file.name,
+            )
+            for path, content in ((file, tomlkit.dumps(document)), (place.file, plan_text)):
+                with durable.replacing(path) as new:
+                    new.write_bytes(content.encode("utf-8"))
+        done = "holds" if corners is not None else "no longer holds"
+        again = self._again(key, session, place)
+        return f"{file.name} {done} the zone {name}; measure again: {again}"
+
+    def _zones(
+        self, key: str, session: Session | None
+    ) -> tuple[tuple[zones.DrawnZone, ...], Path, Place]:
+        """The zones of a recording, their file, and the value that states it."""
+        first = self._places(key, session)[0]
+        of_arena = ("set", "arena") if first.name == "arena" else ()
+        path = (*first.path[:-1], *of_arena, "zones")
+        name = (
+            f"{session.path.stem}.zones.toml" if self._study is None and session else "zones.toml"
+        )
+        stated = None
+        with suppress(FileNotFoundError, PlanError):
+            table = text_files.parse_toml(self._text(first, session))
+            stated = text_files.value_at(table, path)
+        place = replace(first, path=path, stated=stated)
+        file = first.file.with_name(name) if stated is None else first.file.parent / str(stated)
+        found = zones.read_zones(file) if stated is not None and file.is_file() else ()
+        return found, file, place
 
     def depth_image(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
         """The usual depth of every pixel of a study's recording, in the whole image.

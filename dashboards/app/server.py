@@ -73,9 +73,9 @@ class Scenes:
         return {**facts, **size, "measured": session is not None, "marks": found}
 
     def save(self, key: str) -> Any:
-        """Check and save the requested region; returns the page's new facts.
+        """Check and save the requested region or zone; returns the page's new facts.
 
-        The request is JSON with place, corners (px) and was.
+        The request is JSON with corners (px), and place and was, or zone (name and part).
 
         Raises:
             LiexError: the region is invalid, or cannot be saved.
@@ -85,7 +85,11 @@ class Scenes:
             return {"message": "no region is saved here"}, 403 if self.regions is None else 400
         place = str(asked.get("place"))[:40]
         corners, was = asked.get("corners"), asked.get("was")
-        report = self.regions.save(key, self._session(key), place, corners, was)
+        if isinstance(zone := asked.get("zone"), dict):
+            name, part = (str(zone.get(one))[:40] for one in ("name", "part"))
+            report = self.regions.save_zone(key, self._session(key), name, part, corners)
+        else:
+            report = self.regions.save(key, self._session(key), place, corners, was)
         self.data.refresh()
         return {**self.about(key), "saved": report}
 

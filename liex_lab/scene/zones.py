@@ -216,7 +216,7 @@ def zone_names(
         n strings, names joined by `SEPARATOR`; '' for none.
     """
     xy = np.asarray(xy_mm, float)
-    places = {None: xy} | {part: np.asarray(at, float) for part, at in (parts or {}).items()}
+    places: dict[str | None, ArrayLike] = {None: xy, **(parts or {})}
     inside = [(zone.name, zone.contains(places[zone.part])) for zone in zones]
     return [SEPARATOR.join(name for name, is_in in inside if is_in[k]) for k in range(len(xy))]
 
@@ -417,17 +417,28 @@ def read_zones(path: str | Path) -> tuple[DrawnZone, ...]:
     """
     file = Path(path)
     try:
-        return tuple(_ZonesFile.model_validate(read_toml(file)).zones)
+        return zones_of(read_toml(file), str(file))
     except FileNotFoundError:
         raise PlanError(
             f"there is no file {file} with zones; check the spelling of arena.zones"
         ) from None
-    except ValidationError as error:
-        raise PlanError(f"{file}: {_sentence(error)}") from None
     except (ValueError, IsADirectoryError) as error:
         raise PlanError(
             f"{file} should be a TOML file with zones, but it is not ({error}); correct it"
         ) from None
+
+
+def zones_of(table: Mapping[str, Any], origin: str) -> tuple[DrawnZone, ...]:
+    """The zones in the table of a TOML file, as `read_zones`.
+
+    Args:
+        table: its content.
+        origin: the file's name, for messages.
+    """
+    try:
+        return tuple(_ZonesFile.model_validate(table).zones)
+    except ValidationError as error:
+        raise PlanError(f"{origin}: {_sentence(error)}") from None
 
 
 def _sentence(error: ValidationError) -> str:

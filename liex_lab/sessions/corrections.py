@@ -112,7 +112,7 @@ class BoutEdit:
         was: action of the edited bout, for the reader.
         was_start_ns: start of the edited bout, ns; its time is cleared first.
         was_stop_ns: its stop, ns; equal to its start if there was no bout.
-        source: who named it, as in the table `bouts`.
+        source: its author, as in the table `bouts`.
 
     Raises:
         ValueError: the edit is unknown, or the span is empty.

@@ -6,6 +6,7 @@ from playwright.sync_api import Page, expect
 
 from liex_lab.cli.options import region_setting
 from liex_lab.plan import Plan
+from liex_lab.scene.zones import read_zones
 from liex_lab.sessions import Session
 from tests.dashboards.conftest import KEY, Watched
 from tests.dashboards.served import Served
@@ -121,3 +122,23 @@ def assert_saved_by_nobody_else(served: Served, page: Page) -> None:
     foreign = {"Origin": "http://elsewhere.example"}
     assert page.request.post(address, data=asked, headers=foreign).status == 403
     assert not (served.study / "walker.plan.toml").exists()
+
+
+def test_a_zone_is_drawn_named_and_saved_as_a_run_takes_it(
+    served: Served, watched: Watched
+) -> None:
+    page = watched.page
+    opened(served, page)
+    drawn_by_keys(page)
+    page.locator("#zone-name").fill("nest")
+    page.locator("#zone-part").select_option("nose")
+    page.get_by_role("button", name="Save as a zone").click()
+    expect(page.locator(".region-message")).to_contain_text("walker.zones.toml holds the zone nest")
+    expect(page.locator(".zone-line")).to_have_count(1)
+    file = Plan.load(served.study / "walker.plan.toml").arena.zones
+    (zone,) = read_zones(str(file))
+    assert (zone.name, zone.part, zone.unit) == ("nest", "nose", "px")
+    page.locator("#zones").get_by_role("button", name="take out").click()
+    expect(page.locator(".region-message")).to_contain_text("no longer holds the zone nest")
+    expect(page.locator(".zone-line")).to_have_count(0)
+    watched.nothing_went_wrong()

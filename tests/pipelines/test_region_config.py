@@ -9,6 +9,7 @@ from liex_lab.pipelines.region_config import StatedRegions
 from liex_lab.errors import LiexError
 from liex_lab.plan import Plan
 from liex_lab.plan.study import Study
+from liex_lab.scene.zones import read_zones
 from liex_lab.sessions import Session
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -167,3 +168,40 @@ def test_a_recording_that_was_not_measured_is_seen_whole_and_gets_a_region(study
     about = stated.about(KEY, None)
     assert about["region"] is None
     assert "millimetres on the floor" in about["message"]
+
+
+def test_zones_are_drawn_for_a_whole_study_and_taken_out_again(
+    study: Path, walker: Session
+) -> None:
+    stated = StatedRegions(study)
+    said = stated.save_zone(KEY, walker, "nest", "centre", BOX)
+    assert "zones.toml holds the zone nest" in said
+    file = study.with_name("zones.toml")
+    file.write_text("# mine\n" + file.read_text())
+    stated.save_zone(KEY, walker, "ball", "nose", BOX)
+    stated.save_zone(KEY, walker, "nest", "tail_base", BOX)
+    assert [(one.name, one.part, one.unit) for one in read_zones(file)] == [
+        ("ball", "nose", "px"),
+        ("nest", "tail_base", "px"),
+    ]
+    assert file.read_text().startswith("# mine")
+    plans = [one.plan.arena.zones for one in Study.load(study).sessions]
+    assert [Path(str(one)).resolve() for one in plans] == [file.resolve()] * 2
+    assert [one["name"] for one in stated.about(KEY, walker)["zones"]] == ["ball", "nest"]
+    for wrong, why in (("9 b", "letters, digits"), ("x", "arena.region|corners")):
+        with pytest.raises(LiexError, match=why):
+            stated.save_zone(KEY, walker, wrong, "nose", BOX if wrong != "x" else BOX[:2])
+    for name in ("ball", "nest"):
+        stated.save_zone(KEY, walker, name, "nose", None)
+    assert [one.plan.arena.zones for one in Study.load(study).sessions] == [None, None]
+    assert set(STUDY.splitlines()) <= set(study.read_text().splitlines())
+    assert not stated.about(KEY, walker)["zones"]
+
+
+def test_a_session_of_no_study_gets_its_zones_beside_it(walker: Session) -> None:
+    stated = StatedRegions(walker.path.parent)
+    stated.save_zone("walker", walker, "nest", "centre", BOX)
+    file, plan = (walker.path.with_name(f"walker.{one}.toml") for one in ("zones", "plan"))
+    assert [one.name for one in read_zones(str(Plan.load(plan).arena.zones))] == ["nest"]
+    file.unlink()
+    plan.unlink()

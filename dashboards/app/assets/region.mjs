@@ -118,13 +118,22 @@ class Region {
     this.command = make("pre", { id: "region-command" });
     this.saver = button("Save into the plan", "write it into the file", () => this.save(this.shape.corners), { class: "main" });
     this.remover = button("Take it out of the plan", "the arena is found again", () => this.save(null));
+    this.zoneName = make("input", { type: "text", id: "zone-name", size: "14", pattern: "[A-Za-z][A-Za-z0-9_]*", placeholder: "name", "aria-label": "name of the zone" });
+    this.zonePart = make("select", { id: "zone-part", "aria-label": "part of the animal that counts" },
+      ...["centre", "nose", "tail_base"].map((one) => make("option", { value: one }, one.replace("_", " "))));
+    this.zoneSaver = button("Save as a zone", "write it into the file of zones", () => this.saveZone(this.zoneName.value, this.zonePart.value, this.shape.corners));
+    const zones = (this.about.zones || []).map(({ name, part, corners }) => make("li", {}, `${name} (${part.replace("_", " ")}) `,
+      button("show", "take its corners", () => { this.zoneName.value = name; this.zonePart.value = part; this.show(corners); }),
+      button("take out", "remove the zone", () => this.saveZone(name, part, null))));
     const list = make("dl", {});
     KEYS.forEach(([key, does]) => list.append(make("dt", {}, make("kbd", {}, key)), make("dd", {}, does)));
     const may = this.about.may_save && places.length;
     this.side.replaceChildren(
       make("label", { for: "region-corners" }, "Corners x,y in pixels"), this.corners,
       ...(may ? [make("fieldset", {}, make("legend", {}, "It is the region of"), ...places),
-        make("div", { class: "region-bar" }, this.saver, this.remover)] : []),
+        make("div", { class: "region-bar" }, this.saver, this.remover),
+        make("fieldset", { id: "zones" }, make("legend", {}, "Or it is a zone"),
+          make("div", { class: "region-bar" }, this.zoneName, this.zonePart, this.zoneSaver), make("ul", {}, ...zones))] : []),
       this.message, make("h3", {}, "Lines for a plan"), this.lines, make("h3", {}, "Try it first"), this.command,
       make("details", { class: "desk-keys" }, make("summary", {}, "Mouse and keys"), list));
     if (this.about.message) this.notify(this.about.message, true);
@@ -315,6 +324,13 @@ class Region {
       const [u, v] = this.cross;
       parts.push(shape("path", { class: "cross", d: `M${u - 2 * r} ${v}H${u + 2 * r}M${u} ${v - 2 * r}V${v + 2 * r}` }));
     }
+    (this.about.zones || []).forEach((zone) => {
+      const line = shape("polygon", { class: "zone-line", points: zone.corners.map((one) => one.join(",")).join(" ") });
+      const text = shape("title", {});
+      text.textContent = `zone ${zone.name}`;
+      line.append(text);
+      parts.unshift(line);
+    });
     this.layer.replaceChildren(...parts);
     this.update();
   }
@@ -326,21 +342,30 @@ class Region {
     this.command.textContent = closed ? `liex doctor ${this.about.recording || "RECORDING"} --region '${list}'` : "";
     const place = this.about.places.find((one) => one.name === this.about.place);
     this.saver.disabled = !closed;
+    this.zoneSaver.disabled = !closed;
     this.remover.disabled = !place || place.stated === null;
     this.closer.disabled = closed || corners.length < 3;
   }
 
-  async save(corners) {
+  save(corners) {
     const place = this.about.places.find((one) => one.name === this.about.place);
+    return this.send({ place: place.name, corners, was: place.stated }, place.name, corners === null);
+  }
+
+  saveZone(name, part, corners) {
+    if (!/^[A-Za-z][A-Za-z0-9_]*$/.test(name)) { this.notify("a zone has a name of letters, digits and _", true); return null; }
+    return this.send({ zone: { name, part }, corners }, this.about.place, true);
+  }
+
+  async send(asked, place, clear) {
     this.saver.disabled = true;
     try {
       const about = await json(`${this.base}/save`, {
-        method: "POST", headers: { "Content-Type": "application/json" },
-        body: JSON.stringify({ place: place.name, corners, was: place.stated }),
+        method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(asked),
       });
-      this.take({ ...about, place: place.name });
+      this.take({ ...about, place });
       this.panel();
-      if (corners === null) this.change({ corners: [], closed: false });
+      if (clear) this.change({ corners: [], closed: false });
       this.paint();
       this.notify(about.saved);
     } catch (error) {
