@@ -68,8 +68,8 @@ def follow_live(
     """
     if plan.animal.count != 1:
         raise PlanError(
-            f"`liex live` follows one animal, and the plan states animal.count = {plan.animal.count}; "
-            "measure several with `liex run` once the recording is over"
+            f"`liex live` follows one animal, and the plan states animal.count = "
+            f"{plan.animal.count}; measure several with `liex run` once the recording is over"
         )
     if to == "viewer":  # fail early, before a wait of minutes
         need_screen("write a file with --to NAME.rrd, which any viewer opens")
