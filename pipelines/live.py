@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from liex_lab.dashboards.replay.layouts import live_blueprint
 
-from liex_lab.errors import RecordingError
+from liex_lab.errors import PlanError, RecordingError
 from liex_lab.plan import Plan
 from liex_lab.recordings import recording, streaming
 from liex_lab.recordings.frame import marked
@@ -66,6 +66,11 @@ def follow_live(
         LiexError: the source ends before its first frame, cannot be read, there is no screen for a
             viewer, a rule or receiver cannot be used, or the session cannot be written.
     """
+    if plan.animal.count != 1:
+        raise PlanError(
+            f"`liex live` follows one animal, and the plan states animal.count = "
+            f"{plan.animal.count}; measure several with `liex run` once the recording is over"
+        )
     if to == "viewer":  # fail early, before a wait of minutes
         need_screen("write a file with --to NAME.rrd, which any viewer opens")
     watch = TriggerWatch(triggers, plan) if triggers is not None else None

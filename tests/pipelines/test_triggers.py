@@ -66,6 +66,7 @@ def test_what_cannot_be_used_is_refused_before_the_recording_is_opened(tmp_path:
         (["--trigger", "in nest"], "the plan draws none"),
         (["--trigger", "walk", "--send", "ftp://a"], "a trigger is sent to udp://"),
         (["--send", "udp://127.0.0.1:9"], "names a receiver, but no rule"),
+        (["--set", "animal.count=2"], "follows one animal"),
     ):
         found = CliRunner().invoke(cli.app, ["live", "no/such/file", "--to", "none", *options])
         assert isinstance(found.exception, LiexError)
