@@ -29,6 +29,7 @@ Suggest = Callable[[Path], pd.DataFrame]
 Stretch = dict[str, Any]  # start_s, stop_s, kind and why
 
 MOST_ROWS = 2000  # per request
+_LIKELY = 0.01  # probability of an exchange below which a crossing is not listed
 
 
 class Desk(Footage):
@@ -227,14 +228,15 @@ def _plain(values: Any) -> Any:
 #
 # Exchanges of head and tail come from the table `flips`. The tracker may have changed to another
 # object where the body jumps farther than it can move, and, with several animals in view, where
-# another one comes within a body's length or an animal is found again after a loss.
+# another one comes within a body's length or an animal is found again after a loss. Of several
+# measured animals, the table `crossings` comes first: the likeliest exchange that nobody reviewed.
 
 
 def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretch]:
-    """The crossings of a session in order of time.
+    """The crossings of a session: those of several animals by `p_swap`, then others by time.
 
-    Their kind is `ends` (head and tail) or `identity` (the animal and another object); `individual`
-    is the animal's name within the session.
+    Their kind is `swap` (several measured animals), `ends` (head and tail) or `identity` (the
+    animal and another object); `individual` is the animal's name within the session.
 
     Args:
         session: the opened session.
@@ -269,7 +271,26 @@ def crossings(session: Session, animals: Sequence[SessionAnimal]) -> list[Stretc
                 animals[0], away_mm, spine_mm, "two animals", "perhaps the other is followed"
             )
         found += _found_again(animals[0])
-    return sorted(found, key=lambda one: (one["start_s"], one["stop_s"]))
+    found.sort(key=lambda one: (one["start_s"], one["stop_s"]))
+    return [*_unclear(session), *found]
+
+
+def _unclear(session: Session) -> Iterator[Stretch]:
+    """Crossings after which the animals may be exchanged by 1 % or more, and not reviewed."""
+    if not session.has("crossings.parquet"):
+        return
+    table = session.crossings
+    if "reviewed_by" in table:  # missing in earlier versions
+        table = table[table["reviewed_by"] == ""]
+    individual = str(session.metadata["individual"])
+    for one in records(table[table["p_swap"] >= _LIKELY].sort_values("p_swap", ascending=False)):
+        names = one["animals"].split(";")
+        other = next((name for name in names if name != individual), "")
+        why = (
+            f"{' and '.join(names)} perhaps exchanged (p {one['p_swap']:.2f}): `crossing here` "
+            f"if they are right, `swap {other} here` if not"
+        )
+        yield _stretch(one["start_s"], one["stop_s"], "swap", why, individual=individual)
 
 
 def _exchanged_ends(animal: SessionAnimal) -> Iterator[Stretch]:

@@ -21,7 +21,7 @@ from liex_lab.runtime.text_files import loose_json
 from liex_lab.sessions import evidence
 from liex_lab.sessions.corrections import LogEntry, Roles, read_log
 from liex_lab.sessions.session import Session
-from liex_lab.tables.rows import frame_count, rows_between
+from liex_lab.tables.rows import ROUNDED_S, frame_count, rows_between
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.identity import flag_unclear
 from liex_lab.tracking.observations import COLUMNS, Observations
@@ -134,7 +134,7 @@ def check_crossing(session: Session, at_s: float) -> Roles:
     """
     members = arena_sessions(session)
     table = session.crossings
-    inside = table[(table["start_s"] <= at_s) & (at_s <= table["stop_s"])]
+    inside = table[(table["start_s"] - ROUNDED_S <= at_s) & (at_s <= table["stop_s"])]
     if not len(inside):
         begin = ", ".join(f"{one:.3f}" for one in table["start_s"][:10]) or "none"
         raise SessionError(

@@ -81,6 +81,30 @@ def test_exchanged_ends_are_reported_in_words_and_near_ones_together(folder: Pat
     assert {(one["kind"], one["individual"]) for one in found(folder)} == {("ends", "mouse_1")}
 
 
+def test_exchanges_of_measured_animals_come_first_by_their_probability(folder: Path) -> None:
+    put_flips(folder)
+    met = pd.DataFrame(
+        {
+            "start_s": [0.4, 1.0, 2.0, 3.0],
+            "stop_s": [0.6, 1.2, 2.2, 3.2],
+            "animals": "mouse_1;mouse_2",
+            "p_swap": [0.05, 0.3, 0.0, 0.001],
+            "reviewed_by": ["", "", "ada", ""],
+        }
+    )
+    met.to_parquet(folder / "crossings.parquet")
+    (first, second, *others) = found(folder)
+    assert (first["start_s"], first["kind"]) == (1.0, "swap")
+    assert first["why"] == (
+        "mouse_1 and mouse_2 perhaps exchanged (p 0.30): `crossing here` if they are right, "
+        "`swap mouse_2 here` if not"
+    )
+    assert second["start_s"] == 0.4
+    assert {one["kind"] for one in others} == {"ends"}
+    met.drop(columns="reviewed_by").to_parquet(folder / "crossings.parquet")  # earlier versions
+    assert len(found(folder)) == len(others) + 2
+
+
 def test_a_body_that_jumps_farther_than_it_can_go_may_be_another_object(folder: Path) -> None:
     path = folder / "kinematics.parquet"
     moved = pd.read_parquet(path)

@@ -11,6 +11,7 @@ export class Crossings {
     this.all = null;  // until they are loaded
     this.asked = 0;  // the direction requested before they were loaded
     this.turn = 0;  // number of reloads
+    this.at = -1;  // the last one that was shown
     this.count = make("span", { class: "muted desk-crossings" });
     this.parts = [make("div", { class: "desk-bar" },
       button("◀", "Shift and X", () => this.next(-1), { "aria-label": "previous crossing" }),
@@ -19,6 +20,7 @@ export class Crossings {
 
   forget() {  // a correction may change the list
     this.all = null;
+    this.at = -1;
     this.turn += 1;
   }
 
@@ -39,6 +41,11 @@ export class Crossings {
       this.desk.notify("there is no crossing: nowhere were head and tail, or the animal and another object, found to be exchanged or perhaps so");
       return;
     }
+    if (this.all[0].kind === "swap") {  // the likeliest first, not in order of time
+      const last = this.all[this.at], there = last && Math.abs(last.start_s - time) <= NEAR_S;
+      this.go(there ? (this.at + way + n) % n : 0, "");
+      return;
+    }
     const found = way > 0 ? this.all.findIndex((one) => one.start_s > time + NEAR_S)
       : this.all.filter((one) => one.start_s < time - NEAR_S).length - 1;
     const k = found >= 0 ? found : way > 0 ? 0 : n - 1;
@@ -47,6 +54,7 @@ export class Crossings {
 
   go(k, first) {
     const one = this.all[k], several = this.desk.about.animals.length > 1;
+    this.at = k;
     this.desk.stop(one.start_s);
     this.desk.notify(`${first}crossing ${k + 1} of ${this.all.length}, ${one.start_s.toFixed(2)} to ${one.stop_s.toFixed(2)} s`
       + `${several ? `, ${one.individual}` : ""}: ${one.why}`);
