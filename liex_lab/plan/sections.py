@@ -157,7 +157,7 @@ class Circle(SettingsTable):
 
 
 class Rfid(SettingsTable):
-    """RFID readings that tell the animals of one arena apart."""
+    """RFID readings that identify the animals of one arena."""
 
     readings: str = Field(
         description=(
@@ -198,7 +198,7 @@ class AnimalSettings(SettingsTable):
     rfid: Rfid | None = Field(
         None,
         description=(
-            "RFID readings that tell several animals apart: {readings = 'FILE.csv', tags = [...], "
+            "RFID readings that identify several animals: {readings = 'FILE.csv', tags = [...], "
             "antennas = {NAME = {centre = [x, y], radius = r}}}; see docs/howto/rfid.md"
         ),
     )
@@ -214,8 +214,8 @@ class AnimalSettings(SettingsTable):
     def _of_several(self) -> Self:
         if self.rfid is not None and self.count == 1:
             raise ValueError(
-                "[animal.rfid] tells several animals apart, and count is 1; state how many are in "
-                "the arena, or 'auto'"
+                "[animal.rfid] distinguishes several animals, and count is 1; state how many are "
+                "in the arena, or 'auto'"
             )
         return self
 

@@ -189,8 +189,8 @@ class Roles:
 
     def __str__(self) -> str:
         """The sentence for a list of corrections."""
-        said = f"{' and '.join(self.animals)} exchanged" if self.animals else "crossing is right"
-        return f"{said} in frames {self.start_frame} to {self.stop_frame - 1}"
+        what = f"{' and '.join(self.animals)} exchanged" if self.animals else "crossing is right"
+        return f"{what} in frames {self.start_frame} to {self.stop_frame - 1}"
 
 
 Correction = FlipSpan | JointMove | BoutEdit | Description | ClockFit | Roles

@@ -216,9 +216,9 @@ def exchanged(
 def _reviewed(
     crossing: Crossing, order: Slots, entries: Sequence[LogEntry], index: Slots
 ) -> Crossing:
-    """A crossing by the corrected names of its animals, and by whom it was reviewed last.
+    """A crossing by the corrected names of its animals, and the person who reviewed it last.
 
-    Who exchanges animals in it, or up to its end, has reviewed it.
+    Exchanging animals in it, or at its end, is a review.
     """
     some = np.isin(order[crossing.start : crossing.stop], crossing.animals).any(axis=0)
     crossing = replace(crossing, animals=tuple(np.flatnonzero(some).tolist()))
@@ -228,8 +228,10 @@ def _reviewed(
         assert isinstance(one.what, Roles)
         ends = (one.what.start_frame, one.what.stop_frame)
         inner = {*ends} - {int(count[0]), int(count[-1])}
-        said = any(span[0] <= end <= span[1] for end in inner) if one.what.animals else ends == span
-        if said:
+        applies = (
+            any(span[0] <= end <= span[1] for end in inner) if one.what.animals else ends == span
+        )
+        if applies:
             crossing = replace(
                 crossing,
                 p_swap=0.0,

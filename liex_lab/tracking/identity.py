@@ -10,7 +10,7 @@ carries which tag is the map of least cost over the recording (`rfid`). Frames i
 animals are in view follow their neighbours.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -38,6 +38,7 @@ _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
 _OFF = 2.0  # nats, of a reading whose tag is two half lengths beyond the antenna's range
 _COVERED = 0.35  # hidden area, in animals, from which their poses are unknown
+_ONE = 1.4  # usual sizes of an outline, above which it shows several animals
 _JOIN_S = 0.5  # crossings nearer to each other are one
 
 
@@ -99,7 +100,10 @@ def identify(
         slots[full] = states[path]
         by = {"motion": np.zeros_like(sizes), "size": sizes, "rfid": emission}
         crossings = _crossings(observed[0], full, transition, by, path, states)
-    _follow(observed, subjects, slots, known)
+    for start, stop in _follow(observed[0], subjects[0].length_mm, slots, known):
+        unclear = Crossing(start, stop, tuple(range(n_animals)), 0.5, "motion")
+        apart = [one for one in crossings if one.stop <= start or one.start >= stop]
+        crossings = tuple(sorted([*apart, unclear], key=lambda one: one.start))
     return replace(marked, slots=slots, crossings=crossings)
 
 
@@ -139,14 +143,16 @@ def _by_tags(
     totals = [of_animals[reading[:, 0], np.array(one[3])[tag]].sum() for one in found]
     certain = 1.0 / np.exp(min(totals) - np.array(totals)).sum()
     is_off = of_animals[reading[:, 0], np.array(carriers)[tag]] > _OFF
-    said = f"at {is_off.sum()} of {len(tag)} RFID readings the animal is not at the antenna"
-    told = Identity(states[best], (), remarks=(*readings.remarks, *[said] * bool(is_off.any())))
+    off = f"at {is_off.sum()} of {len(tag)} RFID readings the animal is not at the antenna"
+    remarks = (*readings.remarks, *([off] if is_off.any() else []))
+    identity = Identity(states[best], (), remarks=remarks)
     if not len(tag) or is_off.mean() > 0.5 or certain < CERTAIN:
-        why = said if is_off.any() else f"{len(tag)} RFID readings do not distinguish the animals"
+        why = off if is_off.any() else f"{len(tag)} RFID readings do not distinguish the animals"
         advice = "check animal.rfid.antennas and offset_s; the tags were not used"
-        return path, sizes, replace(told, misfits=(f"{why}: {advice}",))
+        return path, sizes, replace(identity, misfits=(f"{why}: {advice}",))
     names = dict(zip(carriers, readings.tags, strict=True))
-    return best, emission, replace(told, tags=tuple(names.get(k, "") for k in range(n_animals)))
+    tags = tuple(names.get(k, "") for k in range(n_animals))
+    return best, emission, replace(identity, tags=tags)
 
 
 def own_observations(observed: Observations, slots: Slots) -> Observations:
@@ -372,27 +378,40 @@ def _backward(transition: Array, emission: Array) -> Array:
 
 
 def _follow(
-    observed: Sequence[Observations],
-    subjects: Sequence[Subject],
-    slots: Slots,
-    known: NDArray[np.bool_],
-) -> None:
-    """Assign the components of frames that do not show all animals, in place, each to the animal
-    that was or will be nearest to it.
+    observed: Observations, length_mm: float, slots: Slots, known: NDArray[np.bool_]
+) -> Iterator[tuple[int, int]]:
+    """Assign the components of frames that do not show all animals, in place, frame by frame from
+    the nearest frame that does.
+
+    A component belongs to the animal of the least cost (d / s)^2 + 2 log s, d: its distance from
+    where that was last in view, s: a standard deviation that grows with the time since.
+
+    Yields:
+        The spans whose two ends do not agree.
     """
-    seconds = observed[0].seconds
-    places = np.array([one.centroid_mm[:, ::2].astype(float) for one in observed[:1]])[0]
+    seconds, places = observed.seconds, observed.centroid_mm[:, ::2, :2].astype(float)
     full = np.flatnonzero((slots != NONE).all(axis=1))
-    if not len(full):
-        return
-    for start, stop in spans(np.asarray(~known.all(axis=1))):
-        before, after = full[full < start][-1:], full[full >= stop][:1]
-        for t in range(start, stop):
-            near = min((*before, *after), key=lambda row: abs(seconds[row] - seconds[t]))
-            there = np.flatnonzero(known[t])
-            off = np.linalg.norm(places[near, slots[near]][:, None] - places[t, there], axis=-1)
-            for _ in there:
-                animal, one = np.unravel_index(np.argmin(off), off.shape)
-                slots[t, animal] = there[one]
-                off[animal] = np.inf
-                off[:, one] = np.inf
+    usual_px = np.median(observed.n_px[full, ::2]) if len(full) else 0.0
+    for start, stop in spans(np.asarray(~known.all(axis=1))) if len(full) else ():
+        ways = np.full((2, stop - start, slots.shape[1]), NONE)
+        near = [*full[full < start][-1:], -1][0], [*full[full >= stop][:1], -1][0]
+        for way, first, step in zip(ways, near, (1, -1), strict=True):
+            last, last_s = places[first, slots[first]], np.full(len(slots[first]), seconds[first])
+            for t in range(start, stop)[::step] if first >= 0 else ():
+                there = np.flatnonzero(known[t])
+                sd = length_mm * (_PLACE_SHARE + np.abs(seconds[t] - last_s))[:, None]
+                off = np.linalg.norm(last[:, None] - places[t, there], axis=-1)
+                cost = (off / sd) ** 2 + 2.0 * np.log(sd)
+                for _ in there:
+                    animal, one = np.unravel_index(np.argmin(cost), cost.shape)
+                    way[t - start, animal] = there[one]
+                    last[animal], last_s[animal] = places[t, there[one]], seconds[t]
+                    cost[animal] = np.inf
+                    cost[:, one] = np.inf
+        since, until = (np.abs(seconds[start:stop] - seconds[row]) for row in near)
+        from_before = since <= until if min(near) >= 0 else np.full(len(since), near[0] >= 0)
+        slots[start:stop] = np.where(from_before[:, None], *ways)
+        # outlines of several animals are those of a contact, which has a probability of its own
+        one_each = (observed.n_px[start:stop] <= _ONE * usual_px).all()
+        if min(near) >= 0 and one_each and (ways[0] != ways[1]).any():
+            yield start, stop

@@ -1,4 +1,4 @@
-"""A person says which of two animals is which: both sessions follow, or neither."""
+"""A person states which of two animals is which: both sessions follow, or neither."""
 
 import shutil
 from dataclasses import replace
@@ -36,27 +36,27 @@ TABLES = ("frames", "poses", "rotations", "kinematics", "bouts", "interactions",
 
 def measured(radius_mm: float) -> Observations:
     mouse = replace(MOUSE, radius_mm=radius_mm)
-    track, seen = mouse.track(), Observations.empty(mouse.skeleton, mouse.times_ns)
+    track, observed = mouse.track(), Observations.empty(mouse.skeleton, mouse.times_ns)
     pose = Pose(SE3(track.root_rotation, track.root_mm), track.angles_rad, track.scale)
     for h, either in enumerate((pose, reversed_pose(mouse.skeleton, pose))):
-        seen.put_pose(h, either)
-        seen.score[:, h], seen.error_mm[:, h], seen.n_px[:, h] = 1.0 + 3.0 * h, 2.0, 100
-        seen.centroid_mm[:, h] = track.joints_mm.mean(axis=1)
-    return seen
+        observed.put_pose(h, either)
+        observed.score[:, h], observed.error_mm[:, h], observed.n_px[:, h] = 1.0 + 3.0 * h, 2.0, 100
+        observed.centroid_mm[:, h] = track.joints_mm.mean(axis=1)
+    return observed
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sessions of two animals, one of them slightly longer, that may have been exchanged."""
     folder = tmp_path_factory.mktemp("pair")
-    seen = [measured(150.0), measured(95.0)]
+    observed = [measured(150.0), measured(95.0)]
     subjects = [
         Subject(MOUSE.skeleton, MOUSE.camera, MOUSE.T_arena_camera, mm, 9.0, 0.5, (1.0,) * 5)
         for mm in (SPINE_MM, SPINE_MM - 2.0)
     ]
     tracked = [
         replace(track_whole(*one), crossings=(CROSSING,))
-        for one in zip(subjects, seen, strict=True)
+        for one in zip(subjects, observed, strict=True)
     ]
     for one in tracked:
         flag_unclear(one)
@@ -75,10 +75,10 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         )
         with SessionWriter(folder / f"pair-{name}.liex", origin) as writer:
             for frames, _ in MOUSE.chunks(N):
-                writer.add(frames, seen[k])
-            verdict = Verdict.of(tracked[k], seen[k], doubts=[doubt([CROSSING])], n_measured=2)
+                writer.add(frames, observed[k])
+            verdict = Verdict.of(tracked[k], observed[k], doubts=[doubt([CROSSING])], n_measured=2)
             writer.note(verdict=verdict.to_dict())
-            writer.take(tracked[k], seen[k], subjects[k])
+            writer.take(tracked[k], observed[k], subjects[k])
             conclude(writer, PLAN, {}, together)
     return folder
 
@@ -214,17 +214,17 @@ def test_what_was_corrected_before_in_these_frames_is_taken_back_first(pair: lis
         correct_session(pair[0], undo=[1], report=False)
 
 
-def test_whoever_has_an_exchange_alone_is_told(pair: list[Path]) -> None:
+def test_whoever_has_an_exchange_alone_is_notified(pair: list[Path]) -> None:
     exchange(pair, 3.0)
     shutil.rmtree(pair[1] / "corrected")
-    (said,) = correcting.disagreements(Session.open(pair[0]))
-    assert said.startswith("pair-animal2.liex does not have the same exchanges")
+    (note,) = correcting.disagreements(Session.open(pair[0]))
+    assert note.startswith("pair-animal2.liex does not have the same exchanges")
     correct_session(pair[0], report=False)
     assert correcting.disagreements(Session.open(pair[0])) == []
     assert len(Session.open(pair[1]).log.shared) == 1
 
 
-def test_bad_input_is_said_in_a_sentence(pair: list[Path], tmp_path: Path) -> None:
+def test_bad_input_gives_a_sentence(pair: list[Path], tmp_path: Path) -> None:
     one, other = opened(pair)
     other.metadata = {**other.metadata, "input": {"sha256": "another"}}
     cases = [
@@ -234,8 +234,8 @@ def test_bad_input_is_said_in_a_sentence(pair: list[Path], tmp_path: Path) -> No
         (lambda: exchange(pair, 3.0, 2.0), "from a time to a later one"),
         (lambda: correcting.parse_correction(one, "swap animal3 1"), "there is no animal3 in"),
     ]
-    for attempt, said in cases:
-        with pytest.raises(SessionError, match=said):
+    for attempt, message in cases:
+        with pytest.raises(SessionError, match=message):
             attempt()
     other = Session.open(pair[1])
     other.metadata = {**other.metadata, "plan": {"animal": {"count": 3}}}

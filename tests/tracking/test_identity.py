@@ -73,6 +73,25 @@ def test_a_frame_that_shows_one_of_two_belongs_to_the_one_that_is_near() -> None
     assert order[40, 0] == order[39, slots[39, near]]
 
 
+@pytest.mark.parametrize("away", [slice(0, 50), slice(30, 60), slice(45, None)])
+def test_an_animal_that_enters_leaves_or_hides_does_not_take_the_name_of_the_other(
+    away: slice,
+) -> None:
+    order = np.tile([0, 1], (len(SECONDS), 1))
+    seen = mixed(2, order)
+    for name in POSE[:-2]:
+        getattr(seen, name)[away, 2:] = np.nan  # the second one
+    seen.n_px[away, 2:] = 0
+    found = identify([seen] * 2, [SUBJECT] * 2, [2000.0] * 2)
+    first = int(np.flatnonzero(found.slots[(found.slots == 1).any(axis=1)][0] == 0)[0])
+    sure = np.ones(len(SECONDS), bool)
+    for one in found.crossings:
+        sure[one.start : one.stop] &= one.p_swap < 0.1
+    assert (found.slots[sure, first] == 0).all()
+    assert sure.mean() > 0.6
+    assert (found.slots[away, 1 - first] == -1).all() or not sure[away].all()
+
+
 @pytest.mark.parametrize("ratio", [1.0, 1.5])
 def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_it(
     ratio: float,

@@ -1,4 +1,4 @@
-"""RFID readings say which of several animals is which, and nothing where they cannot be right."""
+"""RFID readings identify several animals, and nothing where they cannot be right."""
 
 from pathlib import Path
 from typing import Any
@@ -37,38 +37,38 @@ def read(folder: Path, lines: str, arena: Arena = ARENA, **more: Any) -> Reading
 
 
 def unclear() -> tuple:
-    """Two animals that meet slowly and part, so that motion does not tell which is which."""
+    """Two animals that meet slowly and part, so that motion does not distinguish them."""
     order = np.tile([0, 1], (N, 1))
-    seen = mixed(2, order)
-    lose(seen, LOST)
-    middle = 0.5 * (seen.place[:, :1] + seen.place[:, 2:3])
+    shown = mixed(2, order)
+    lose(shown, LOST)
+    middle = 0.5 * (shown.place[:, :1] + shown.place[:, 2:3])
     apart = np.clip(np.abs(np.arange(N) - 47.0) / 400.0, 0.0, 1.0)
-    seen.place[:] = middle + apart[:, None, None] * (seen.place - middle)
-    seen.centroid_mm[:] = seen.place
-    seen.place[LOST] = seen.centroid_mm[LOST] = np.nan
-    return [seen] * 2, [SUBJECT] * 2, [2000.0] * 2
+    shown.place[:] = middle + apart[:, None, None] * (shown.place - middle)
+    shown.centroid_mm[:] = shown.place
+    shown.place[LOST] = shown.centroid_mm[LOST] = np.nan
+    return [shown] * 2, [SUBJECT] * 2, [2000.0] * 2
 
 
 def spread() -> tuple:
-    """The same animals farther apart, so that antennas tell them from each other."""
-    seen, subjects, areas = unclear()
+    """The same animals farther apart, so that antennas distinguish them."""
+    shown, subjects, areas = unclear()
     away = np.array([[-200.0, 0, 0], [200.0, 0, 0]], np.float32).repeat(2, axis=0)
     late = np.clip(np.abs(np.arange(N) - 47.0) - 8.0, 0.0, 20.0)[:, None, None] / 20.0
-    for one in (seen[0].place, seen[0].centroid_mm):
+    for one in (shown[0].place, shown[0].centroid_mm):
         one[:, :4] += (late * away).astype(np.float32)
-    return seen, subjects, areas
+    return shown, subjects, areas
 
 
 @pytest.mark.parametrize("crossed", [False, True])
-def test_readings_after_a_crossing_decide_who_is_who(crossed: bool) -> None:
-    seen, subjects, areas = spread()
-    before = identify(seen, subjects, areas)
+def test_readings_after_a_crossing_decide_which_is_which(crossed: bool) -> None:
+    shown, subjects, areas = spread()
+    before = identify(shown, subjects, areas)
     assert max(one.p_swap for one in before.crossings) > 0.1
     rows, slots = np.array([5, 12, 75, 85]), np.array([0, 1, 0, 1])
     tags = np.array([0, 1, *([1, 0] if crossed else [0, 1])])
-    places = seen[0].centroid_mm[rows, 2 * slots, :2]
+    places = shown[0].centroid_mm[rows, 2 * slots, :2]
     readings = Readings(TAGS, tags, SECONDS[rows], np.column_stack([places, np.full(4, 30.0)]))
-    found = identify(seen, subjects, areas, readings)
+    found = identify(shown, subjects, areas, readings)
     ada = found.tags.index("ada")
     assert (found.slots[: LOST.start, ada] == 0).all()
     assert (found.slots[LOST.stop :, ada] == int(crossed)).all()
@@ -78,30 +78,30 @@ def test_readings_after_a_crossing_decide_who_is_who(crossed: bool) -> None:
     assert (found.misfits, found.remarks) == ((), ())
 
 
-def test_readings_where_no_animal_is_change_nothing_and_are_said() -> None:
-    seen, subjects, areas = spread()
-    before = identify(seen, subjects, areas)
+def test_readings_where_no_animal_is_change_nothing_and_are_reported() -> None:
+    shown, subjects, areas = spread()
+    before = identify(shown, subjects, areas)
     nowhere = np.tile([900.0, 900.0, 30.0], (6, 1))
     readings = Readings(TAGS, np.array([0, 1] * 3), SECONDS[[5, 12, 20, 75, 80, 85]], nowhere)
-    found = identify(seen, subjects, areas, readings)
+    found = identify(shown, subjects, areas, readings)
     np.testing.assert_array_equal(found.slots, before.slots)
     assert found.crossings == before.crossings
     assert found.misfits[0].startswith("at 6 of 6 RFID readings the animal is not at the antenna")
     assert found.tags == ()
     wide = np.tile([0.0, 0.0, 2000.0], (2, 1))  # both animals are within its range
     readings = Readings(TAGS, np.array([0, 1]), SECONDS[[5, 12]], wide)
-    found = identify(seen, subjects, areas, readings)
+    found = identify(shown, subjects, areas, readings)
     assert found.tags == ()
     assert "2 RFID readings do not distinguish the animals" in found.misfits[0]
 
 
 def test_one_wrong_reading_does_not_exchange_animals_that_stay_apart() -> None:
-    seen, subjects, areas = spread()
+    shown, subjects, areas = spread()
     rows, slots = np.array([5, 12, 20, 30]), np.array([0, 1, 0, 0])
-    places = seen[0].centroid_mm[rows, 2 * slots, :2]
+    places = shown[0].centroid_mm[rows, 2 * slots, :2]
     antennas = np.column_stack([places, np.full(4, 30.0)])
     readings = Readings(TAGS, np.array([0, 1, 0, 1]), SECONDS[rows], antennas)
-    found = identify(seen, subjects, areas, readings)
+    found = identify(shown, subjects, areas, readings)
     assert (found.slots[:30, found.tags.index("ada")] == 0).all()
     assert found.remarks == ("at 1 of 4 RFID readings the animal is not at the antenna",)
 
@@ -124,7 +124,7 @@ def test_readings_that_cannot_be_used_are_left_out_and_counted(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("lines", "more", "said"),
+    ("lines", "more", "message"),
     [
         ("1,A,ada\n0.5,A,ada\n", {}, "line 3 of .* is earlier than the one before"),
         ("1,C,ada\n", {}, "has readings at C, whose place is not stated"),
@@ -139,10 +139,10 @@ def test_readings_that_cannot_be_used_are_left_out_and_counted(tmp_path: Path) -
         ),
     ],
 )
-def test_a_bad_file_or_plan_is_said_in_a_sentence(
-    tmp_path: Path, lines: str, more: dict[str, Any], said: str
+def test_a_bad_file_or_plan_gives_a_sentence(
+    tmp_path: Path, lines: str, more: dict[str, Any], message: str
 ) -> None:
-    with pytest.raises(LiexError, match=said):
+    with pytest.raises(LiexError, match=message):
         read(tmp_path, lines, **more)
 
 
@@ -157,7 +157,7 @@ def test_what_is_not_known_of_the_arena_or_not_a_table_is_no_traceback(tmp_path:
     rfid = (
         "animal.rfid={readings='r.csv', tags=['a'], antennas={A={centre=[0.0, 0.0], radius=9.0}}}"
     )
-    with pytest.raises(PlanError, match="tells several animals apart, and count is 1"):
+    with pytest.raises(PlanError, match="distinguishes several animals, and count is 1"):
         Plan.load("mouse").with_settings([rfid])
     plan = Plan.load("mouse").with_settings(["animal.count=2", rfid])
     assert Plan.from_toml(plan.to_toml()) == plan
