@@ -156,7 +156,7 @@ def test_a_crossing_that_was_checked_is_certain_in_both(
         np.testing.assert_array_equal(joints(one), joints(was))
         assert one.crossings["p_swap"].tolist() == [0.0]
         assert one.crossings["reviewed_by"].tolist() == ["ada"]
-        assert (was.frames["flag"][60:75] == "doubtful").all()
+        assert (was.frames["flag"][60:75] == "unclear").all()
         assert one.path in reports
         assert (one.frames["flag"] == "").all()
     with pytest.raises(SessionError, match=r"holds 7 s; crossings begin at 2.000"):
