@@ -216,7 +216,7 @@ def zone_names(
         n strings, names joined by `SEPARATOR`; '' for none.
     """
     xy = np.asarray(xy_mm, float)
-    places: dict[str | None, ArrayLike] = {None: xy, **(parts or {})}
+    places = {None: xy} | {part: np.asarray(at, float) for part, at in (parts or {}).items()}
     inside = [(zone.name, zone.contains(places[zone.part])) for zone in zones]
     return [SEPARATOR.join(name for name, is_in in inside if is_in[k]) for k in range(len(xy))]
 
