@@ -218,7 +218,7 @@ def exchanged(
 def _reviewed(
     crossing: Crossing, order: Slots, entries: Sequence[LogEntry], index: Slots
 ) -> Crossing:
-    """A crossing by the corrected names of its animals, and the person who reviewed it last.
+    """A crossing by the corrected names of its animals, and its last reviewer.
 
     Exchanging animals in it, or at its end, is a review.
     """
