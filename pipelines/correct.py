@@ -210,6 +210,7 @@ def _refuse_moved(session: Session, log: corrections.Log, names: Sequence[str]) 
     was, now = (identities.shown(one.shared, names, index)[:, own] for one in (before, log))
 
     moved = was != now
+    last = max((entry.number for entry in log.shared), default=0)
     rows: dict[type, Callable[[Any], NDArray[np.bool_]]] = {
         corrections.FlipSpan: lambda one: (one.start_frame <= index) & (index < one.stop_frame),
         corrections.JointMove: lambda one: index == one.frame,
@@ -217,8 +218,10 @@ def _refuse_moved(session: Session, log: corrections.Log, names: Sequence[str]) 
     }
     numbers = [
         str(entry.number)
-        for entry in before.standing
-        if (touched := rows.get(type(entry.what))) and (moved & touched(entry.what)).any()
+        for entry in log.standing
+        if (entry in before.standing or entry.number < last)
+        and (touched := rows.get(type(entry.what)))
+        and (moved & touched(entry.what)).any()
     ]
     if numbers:
         raise SessionError(

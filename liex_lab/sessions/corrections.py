@@ -16,7 +16,7 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, field
+from dataclasses import asdict, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -179,14 +179,14 @@ class Roles:
         start_frame: first frame, the camera's count.
         stop_frame: the first frame after the span.
         sessions: names of the folders of all animals of the arena, which have the same parent.
-        serial: number among these corrections in the arena, from 1.
+        serial: number among these corrections in the arena, from 1; 0 until it is in a log.
     """
 
     animals: tuple[str, ...]
     start_frame: int
     stop_frame: int
     sessions: tuple[str, ...]
-    serial: int
+    serial: int = 0
     kind: Literal["roles"] = "roles"
 
     def __str__(self) -> str:
@@ -354,6 +354,11 @@ class Log:
                 raise SessionError(
                     f"there is no correction {number} to take back; those that stand are {active}"
                 )
+        serial = max((e.what.serial for e in self.entries if isinstance(e.what, Roles)), default=0)
+        what = [
+            replace(one, serial=serial + k) if isinstance(one, Roles) and not one.serial else one
+            for k, one in enumerate(what, 1)
+        ]
         author = author or author_name()
         now = datetime.now(UTC).isoformat(timespec="seconds")
         first = 1 + max((entry.number for entry in self.entries), default=0)

@@ -119,7 +119,9 @@ def swap(
     )
     count = frame_count(session.frames["frame_index"].to_numpy(np.int64))
     first, last = (int(count[row]) for row in rows)
-    return Roles((names[0], names[1]), first, last, *_shared_by(members))
+    return Roles(
+        (names[0], names[1]), first, last, tuple(one.path.name for one in members.values())
+    )
 
 
 def check_crossing(session: Session, at_s: float) -> Roles:
@@ -141,7 +143,7 @@ def check_crossing(session: Session, at_s: float) -> Roles:
             f"no crossing of {session.path} holds {at_s:g} s; crossings begin at {begin} (s)"
         )
     first, last = (int(inside[f"{end}_frame"].iloc[0]) for end in ("start", "stop"))
-    return Roles((), first, last, *_shared_by(members))
+    return Roles((), first, last, tuple(one.path.name for one in members.values()))
 
 
 def one_sided(session: Session) -> list[str]:
@@ -251,11 +253,3 @@ def _is_of_one_run(about: Mapping[str, object], other: Mapping[str, object]) -> 
         )
         facts.append((source.get("sha256"), {**plan, "session": None}, "individual" in one))
     return facts[0] == facts[1]
-
-
-def _shared_by(members: Mapping[str, Session]) -> tuple[tuple[str, ...], int]:
-    """Names of the sessions' folders, and the number of their next correction of identity."""
-    known = [
-        getattr(e.what, "serial", 0) for s in members.values() for e in read_log(s.path).entries
-    ]
-    return tuple(one.path.name for one in members.values()), 1 + max(known, default=0)

@@ -205,6 +205,10 @@ def test_what_was_corrected_before_in_these_frames_is_taken_back_first(pair: lis
     with pytest.raises(SessionError, match=r"of the present one \(1 in `liex correct list`\)"):
         exchange(pair, 0.5, 1.2)
     assert not list(pair[0].parent.glob("*/corrected.*"))
+    one, other = opened(pair)
+    both = [correcting.flip_span(one, 1.0, 1.2), identities.swap(one, other, 0.9, 1.5)]
+    with pytest.raises(SessionError, match="of the present one"):
+        correct_session(pair[0], both, report=False)
     flip = correcting.flip_span(Session.open(pair[1]), 4.0, 5.0)
     correct_session(pair[1], [flip], report=False)  # of the animal that it is now
     tip = joints(Session.open(pair[1]))[140, -1]
@@ -252,6 +256,18 @@ def test_bad_input_gives_a_sentence(pair: list[Path], tmp_path: Path) -> None:
     with pytest.raises(SessionError, match="is the only animal that was measured"):
         correcting.parse_correction(alone, "crossing 2")
     assert not (pair[0] / "corrected").exists()
+
+
+def test_exchanges_that_are_made_at_once_are_numbered(pair: list[Path]) -> None:
+    one, other = opened(pair)
+    twice = [identities.swap(one, other, 1.0), identities.swap(one, other, 1.0)]
+    correct_session(pair[0], twice, report=False)
+    assert [
+        [entry.what.serial for entry in read_log(path).shared]  # type: ignore[union-attr]
+        for path in pair
+    ] == [[1, 2]] * 2
+    (met,) = Session.open(pair[1]).crossings.to_dict("records")
+    assert met["p_swap"] == 0.4, "nobody reviewed it"
 
 
 def test_exchanges_of_several_animals_compose_in_their_order() -> None:
