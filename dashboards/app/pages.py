@@ -27,8 +27,9 @@ from liex_lab.behaviour import body, cohort
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan.study import references_first
 from liex_lab.sessions import Session, correcting, corrections
+from liex_lab.sessions.individuals import individuals_of
 
-from ..figures import groups, sets, times
+from ..figures import groups, sets, social, times
 from ..figures.style import (
     LEFT_MM,
     ONE_COLUMN_MM,
@@ -463,6 +464,10 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
     extent = f"{frames['n_frames']:,} frames, {frames['duration_s']:.1f} s"
     path = quote(key, safe="")
     kinds = dict.fromkeys(mark.kind for mark in scene_marks(session))
+    own = str(session.metadata["individual"])
+    named = (
+        f"{key.removesuffix(f'-{own}')}-{one}" for one in individuals_of(session) if one != own
+    )
     files = [
         (f"{name}.csv", f"/session-csv/{path}/{name}.csv")
         for name in tables.session_tables(data, key)
@@ -476,6 +481,10 @@ def session_facts(data: StudyData, key: str) -> dict[str, Any]:
         "author": corrections.author_name(),
         "scene": [(kind, MARKS[kind][0]) for kind in kinds],
         "arena": f"/arena/{path}",
+        "others": [one for one in named if one in data.entries],
+        "together": session.has("interactions.parquet"),
+        "network": social.met(session),
+        "crossings": session.has("crossings.parquet"),
         "report": f"/report/{path}" if session.has("report.html") else "",
         "files": files,
     }

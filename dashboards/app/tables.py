@@ -111,7 +111,29 @@ STATES = {
     "begun": "interrupted",
     "excluded": "left out",
 }
-_OF_SESSION = {"bouts": BOUTS, "gaps": GAPS, "flips": FLIPS}
+INTERACTIONS = {
+    "agent": "animal",
+    "action": "interaction",
+    "target": "with",
+    "start_s": "from, s",
+    "stop_s": "to, s",
+    "duration_s": "lasts, s",
+    "score": "score",
+}
+CROSSINGS = {
+    "start_s": "from, s",
+    "stop_s": "to, s",
+    "animals": "animals",
+    "p_swap": "probability",
+    "decided_by": "decided by",
+}
+_OF_SESSION = {
+    "bouts": BOUTS,
+    "gaps": GAPS,
+    "flips": FLIPS,
+    "interactions": INTERACTIONS,
+    "crossings": CROSSINGS,
+}
 
 
 def find(data: StudyData, name: str) -> Table:
@@ -120,7 +142,7 @@ def find(data: StudyData, name: str) -> Table:
     Args:
         data: the study.
         name: sessions, summaries, stats/MEASURE/REFERENCE (the reference may be empty), or
-            bouts/KEY, gaps/KEY, flips/KEY of a session.
+            bouts/KEY, gaps/KEY, flips/KEY, interactions/KEY, crossings/KEY of a session.
 
     Raises:
         SessionError: there is no such table or session.

@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from liex_lab.actions.vocabulary import INTERACTIONS, individual_colours
+from liex_lab.sessions import Session
 from liex_lab.sessions.individuals import arena_name, individuals_of
 
 from .animals import Array, SessionAnimal
@@ -15,13 +16,18 @@ _ROW_MM = 8.0
 _DIRECTED = [word for word, one in INTERACTIONS.items() if not one.mutual]
 
 
+def met(session: Session) -> bool:
+    """Whether any animal of the session's arena did anything to another one."""
+    return session.has("interactions.parquet") and bool(
+        (session.interactions["target"] != "").any()
+    )
+
+
 def _pairs(animal: SessionAnimal) -> pd.DataFrame | None:
     """The totals of ordered pairs; None without an interaction."""
-    table = animal.table("interaction_totals")
-    if table is None:
+    if not met(animal.session):
         return None
-    table = table[table["target"] != ""]
-    return table if (table["count"] > 0).any() else None
+    return animal.session.interaction_totals.query("target != ''")
 
 
 def interaction_matrix(animal: SessionAnimal) -> Figure | None:

@@ -1,10 +1,13 @@
 """Who did what to whom, as figures: what the tables count stands in them."""
 
 import pytest
+from liex_lab.dashboards.app.data import StudyData
+from liex_lab.dashboards.app.server import make_app
 from liex_lab.dashboards.figures import social
 from liex_lab.dashboards.figures.animals import SessionAnimal, session_animals
 from liex_lab.dashboards.figures.style import drawing, image_bytes
 from liex_lab.dashboards.report.report import render
+from liex_lab.pipelines.study.run import list_sessions
 
 from liex_lab.sessions import Session
 from tests.sessions.pair import write_pair
@@ -53,3 +56,14 @@ def test_the_report_of_several_has_them_and_that_of_one_has_not(pair, tmp_path):
     with drawing():
         assert social.interaction_matrix(animal(alone)) is None
         assert social.interaction_network(animal(alone)) is None
+
+
+def test_the_page_of_a_session_shows_interactions_and_leads_to_the_other_animal(pair):
+    client = make_app(StudyData(*list_sessions(pair[0].path.parent))).test_client()
+    page = client.get("/session/pair-animal1").text
+    assert ">Interactions<" in page
+    assert 'href="/session/pair-animal2"' in page
+    assert 'src="/figure/pair-animal1/network.svg"' in page
+    assert client.get("/figure/pair-animal1/network.svg").status_code == 200
+    events = pair[0].interactions.query("target != ''")
+    assert page.count(">animal2</td>") >= len(events.query("target == 'animal2'"))
