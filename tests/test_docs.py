@@ -43,6 +43,7 @@ def test_every_file_that_a_page_names_exists(page: Path) -> None:
         "gerbil.toml",
         "camera.toml",
         "raytrix.toml",
+        "zones.toml",
         "study/study.toml",
     }  # by the program, or by a user
     made |= {"figures/", "study/study.toml", "study/derivatives/liex-lab/sub-m01/ses-day1/behav/"}
