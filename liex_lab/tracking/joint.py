@@ -8,7 +8,7 @@ such an explanation is
     sum over observed pixels of min(|z_rendered - z_observed|, c) + c times the rendered pixels
     beside the component, over the observed pixels; c where nothing is rendered.
 
-The best explanations are then improved alternately: every pixel goes to the body whose surface is
+The best explanation is then improved alternately: every pixel goes to the body whose surface is
 nearest to it in depth, or in the image where none is rendered, and each body is measured again on
 its own pixels (hard expectation maximisation). A component that one body explains as well is one
 animal. Only components of several animals pay for all this.
@@ -46,7 +46,6 @@ _FEWEST = 5  # frames in which all stand apart
 _LEAST_SHARE = 0.3  # area of an animal over that of the largest one in view
 _LEAST_AREA = 0.5  # of an animal's visible part, over the usual area of the smallest one
 _N_DIRECTIONS = 4  # of the cuts, in half a turn
-_KEPT = 2  # explanations that are improved
 _SWEEPS = 2
 _MOST_OFF = 0.2  # of a pixel, in roots of the animal's area
 _BETTER = 0.85  # cost of several bodies over that of one
@@ -238,20 +237,16 @@ class JointTracker:
         q = len(blobs.n_px)
         labels, bodies = self._cuts(blobs, m)
         cost, drawn = self._tried(blobs, labels, bodies)
-        rows = np.arange(q)[:, None]
-        order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
-        best = rows[:, 0], order[:, 0]
-        kept_cost, kept = cost[best], labels[best]
-        for k in range(order.shape[1]):
-            at = rows[:, 0], order[:, k]
-            now, own, shown = labels[at][:, None], bodies[at][:, None], drawn[at]
-            for _ in range(_SWEEPS):
-                now = self._owners(blobs, shown, now[:, 0])[:, None]
-                again, fresh = self._tried(blobs, now, own)
-                better = again[:, 0] < kept_cost
-                kept_cost = np.where(better, again[:, 0], kept_cost)
-                kept = np.where(better[:, None, None], now[:, 0], kept)
-                shown = fresh[:, 0]
+        rows, best = np.arange(q), cost.argmin(axis=1)
+        kept_cost, kept, shown = cost[rows, best], labels[rows, best], drawn[rows, best]
+        now = kept
+        for _ in range(_SWEEPS):
+            now = self._owners(blobs, shown, now)
+            again, fresh = self._tried(blobs, now[:, None], bodies[rows, best][:, None])
+            better = again[:, 0] < kept_cost
+            kept_cost = np.where(better, again[:, 0], kept_cost)
+            kept = np.where(better[:, None, None], now, kept)
+            shown = fresh[:, 0]
         alone, _ = self._tried(
             blobs,
             np.where(blobs.heights > 0, 0, -1)[:, None].repeat(len(self._bodies), axis=1),
