@@ -82,38 +82,40 @@ def open_results(
         ) from None
     try:
         file = h5py.File(path, "r")
-    except OSError as error:
+        with closing_on_error(file):
+            return _recording(path, file, camera, fps)
+    except (OSError, RuntimeError, KeyError) as error:  # as h5py reports damage
         raise RecordingError(
             f"{path} should be the results of moseq2-extract (HDF5), but: {one_line(error)}; copy "
             "it again, or give the recording itself"
         ) from None
-    with closing_on_error(file):
-        camera_file = CameraFile.read(path.parent / CAMERA_FILE)
-        problems = list(camera_file.problems)
-        doubts: list[str] = []
-        results = _Results(path, file, problems)
-        metadata = _metadata(path, file)
-        results.check_first_frame(doubts)
-        monotone = make_monotone(_times(path, file, results, camera_file, fps, problems, doubts))
-        problems += [*metadata.problems, *filter(None, [monotone.problem])]
-        height, width = results.scene.shape
-        return Recording(
-            name=path.stem if path.parent.name != "proc" else f"{path.parents[1].name}_{path.stem}",
-            format=FORMAT,
-            camera=camera_file.camera(width, height, camera)
-            if camera is not None or camera_file.intrinsics
-            else assumed_camera(
-                path, (width, height), metadata.camera or KINECT, metadata, problems
-            ),
-            times_ns=monotone.times_ns,
-            read=results.read,
-            sources=[path],
-            problems=problems,
-            close=file.close,
-            faults=monotone.faults,
-            doubts=doubts,
-            metadata={"profile": results.facts(), **metadata.facts, **camera_file.metadata},
-        )
+
+
+def _recording(path: Path, file: h5py.File, camera: Lens | None, fps: float | None) -> Recording:
+    camera_file = CameraFile.read(path.parent / CAMERA_FILE)
+    problems = list(camera_file.problems)
+    doubts: list[str] = []
+    results = _Results(path, file, problems)
+    metadata = _metadata(path, file)
+    results.check_first_frame(doubts)
+    monotone = make_monotone(_times(path, file, results, camera_file, fps, problems, doubts))
+    problems += [*metadata.problems, *filter(None, [monotone.problem])]
+    height, width = results.scene.shape
+    return Recording(
+        name=path.stem if path.parent.name != "proc" else f"{path.parents[1].name}_{path.stem}",
+        format=FORMAT,
+        camera=camera_file.camera(width, height, camera)
+        if camera is not None or camera_file.intrinsics
+        else assumed_camera(path, (width, height), metadata.camera or KINECT, metadata, problems),
+        times_ns=monotone.times_ns,
+        read=results.read,
+        sources=[path],
+        problems=problems,
+        close=file.close,
+        faults=monotone.faults,
+        doubts=doubts,
+        metadata={"profile": results.facts(), **metadata.facts, **camera_file.metadata},
+    )
 
 
 class _Results:
@@ -179,7 +181,7 @@ class _Results:
                 "and there are no walls"
             )
             stored = np.full(roi.shape, self.floor_mm)
-        self.scene = np.nan_to_num(stored).astype(np.float32)
+        self.scene = np.clip(np.nan_to_num(stored), 0, 65_535).astype(np.float32)
         self._level = np.floor(self.scene)  # MoSeq cuts heights to whole mm, and depth is whole
         if self.floor_mm is not None and _number(self._file, f"{_PARAMETERS}graduate_walls"):
             self._level = np.maximum(self._level, np.floor(np.float32(self.floor_mm)))
@@ -327,7 +329,7 @@ def _metadata(path: Path, file: h5py.File) -> Metadata:
             if getattr(entry, "shape", None) is not None and entry.size <= 16:
                 value = entry[()]
                 plain = value.tolist() if hasattr(value, "tolist") else value
-                document[key] = (
+                document[str(key)] = (
                     plain.decode(errors="replace") if isinstance(plain, bytes) else plain
                 )
     kind = file.get(f"{_PARAMETERS}camera_type")
