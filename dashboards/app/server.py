@@ -404,7 +404,8 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
         """Set the security headers of a `response`; its own content policy is kept."""
         response.headers.setdefault("Content-Security-Policy", _POLICY)
         response.headers["X-Content-Type-Options"] = "nosniff"
-        response.headers["Referrer-Policy"] = "no-referrer"
+        # not "no-referrer": a form would then be sent as if from another site
+        response.headers["Referrer-Policy"] = "same-origin"
         return response
 
     @server.errorhandler(413)
