@@ -215,6 +215,7 @@ def serve_dashboard(
         ) from None
     from liex_lab.dashboards.app.data import StudyData
     from liex_lab.dashboards.report.report import write_views
+    from liex_lab.pipelines.bench import Bench
     from liex_lab.pipelines.correct import correct_session
     from liex_lab.pipelines.region_config import StatedRegions
     from liex_lab.pipelines.training.action_model import suggest
@@ -236,5 +237,6 @@ def serve_dashboard(
         suggest=suggest,
         reviews=place / REVIEWS,
         regions=StatedRegions(study),
+        measuring=Bench(place.resolve()) if alone else None,
     )
     serve(app, host, port, lambda found: echo(address(host, found, token)))

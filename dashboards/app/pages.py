@@ -91,6 +91,7 @@ class Pages:
         show_replay: opens the replay of a .rrd at a time (s); None only shows the command.
         may_correct: whether corrections are saved.
         of_recordings: whether regions can be drawn for recordings without results.
+        measuring: lists, examines and measures recordings, see `make_app`; None measures none.
     """
 
     data: StudyData
@@ -98,6 +99,7 @@ class Pages:
     show_replay: ShowReplay | None
     may_correct: bool
     of_recordings: bool
+    measuring: Any = None
 
     def table(self, name: str, **how: Any) -> Markup:
         """A table as HTML, by its name; see `tables.find` and `tables.fill`."""
@@ -143,6 +145,44 @@ class Pages:
     def review(self) -> str:
         """The page of blinded reviews."""
         return render_template("review.html")
+
+    def bench(self) -> str:
+        """The page on which a recording is chosen, examined and measured."""
+        listed = self._bench().listed(request.args.get("at", ""))
+        parts = [part for part in listed["at"].split("/") if part]
+        trail = [(part, "/".join(parts[: k + 1])) for k, part in enumerate(parts)]
+        entries = [(name, "folder") for name in listed["folders"]]
+        entries += [(name, "file") for name in listed["files"]]
+        prefix = f"{listed['at']}/" if listed["at"] else ""
+        job = self.measuring.state()
+        return render_template(
+            "bench.html", trail=trail, entries=entries, prefix=prefix, job=job, **listed
+        )
+
+    def bench_start(self) -> Any:
+        """Start the requested job, and show the folder of its recording."""
+        at = request.form.get("at", "")
+        self._bench().start(request.form.get("verb", ""), at, request.form.get("plan", ""))
+        return redirect(f"/bench?at={quote(at.rpartition('/')[0])}", 303)
+
+    def bench_stop(self) -> Any:
+        """Stop the job."""
+        self._bench().stop()
+        return redirect("/bench", 303)
+
+    def bench_state(self) -> Any:
+        """What the job has done."""
+        return jsonify(self._bench().state())
+
+    def bench_done(self) -> Any:
+        """The sessions, with the one that was measured."""
+        self.data.refresh()
+        return redirect("/", 303)
+
+    def _bench(self) -> Any:
+        if self.measuring is None:
+            raise SessionError("nothing is measured here; start the dashboard on this machine")
+        return self.measuring
 
     def arena(self, key: str) -> str:
         """The page on which a region is drawn."""
@@ -264,6 +304,7 @@ def add_handlers(app: Flask, pages: Pages) -> None:
         here = "/" if path.startswith(("/session", "/arena")) else path
         functions = {"csv_address": tables.csv_address, "session_address": session_address}
         names = {"study": pages.data.name, "here": here, "grey": GREY, "table": pages.table}
+        names["measuring"] = pages.measuring is not None
         return {**names, **functions}
 
     @app.errorhandler(LiexError)

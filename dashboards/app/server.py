@@ -181,6 +181,7 @@ def make_app(
     suggest: Suggest | None = None,
     reviews: Path | None = None,
     regions: Any = None,
+    measuring: Any = None,
 ) -> Flask:
     """Make the dashboard of a study; `serve` serves it.
 
@@ -201,6 +202,8 @@ def make_app(
             `save(key, session, place, corners, was)`, which saves corners (px) in a place that
             contained `was`; and `depth_image(key)`, the usual depth (mm) of every pixel, and the
             camera. None writes none.
+        measuring: lists and measures recordings below a folder: `listed(at)`, `start(verb, at,
+            plan)`, `stop()` and `state()`. None measures none.
     """
     app = Flask(
         "liex_lab_dashboard",
@@ -222,7 +225,7 @@ def make_app(
     saver = corrections.Saver(correct, report) if correct is not None else None
     app.extensions[_SAVER] = saver
     of_recordings = regions is not None and regions.of_recordings
-    shown = pages.Pages(data, desk_of, show_replay, saver is not None, of_recordings)
+    shown = pages.Pages(data, desk_of, show_replay, saver is not None, of_recordings, measuring)
     pages.add_handlers(app, shown)
     clerk = corrections.Clerk(desk_of, saver)
     scenes = Scenes(data, images, regions)
@@ -234,6 +237,11 @@ def make_app(
         "GET /groups": shown.groups,
         "GET /group-figure/<path:measure>.svg": shown.group_figure,
         "GET /review": shown.review,
+        "GET /bench": shown.bench,
+        "GET /bench/state": shown.bench_state,
+        "GET /bench/done": shown.bench_done,
+        "POST /bench/start": shown.bench_start,
+        "POST /bench/stop": shown.bench_stop,
         "GET /arena/<path:key>": shown.arena,
         "GET /session/<path:key>": shown.session,
         "GET /whole/<path:key>": shown.whole,
@@ -396,7 +404,8 @@ def guard(server: Flask, token: str, *, alone: bool = True) -> None:
         """Set the security headers of a `response`; its own content policy is kept."""
         response.headers.setdefault("Content-Security-Policy", _POLICY)
         response.headers["X-Content-Type-Options"] = "nosniff"
-        response.headers["Referrer-Policy"] = "no-referrer"
+        # not "no-referrer": a form would then be sent as if from another site
+        response.headers["Referrer-Policy"] = "same-origin"
         return response
 
     @server.errorhandler(413)

@@ -57,7 +57,7 @@ from liex_lab.cli.sessions import (
 )
 from liex_lab.errors import LiexError, MisfitError, RecordingError, printable
 from liex_lab.runtime import durable, memory, processes
-from liex_lab.runtime.progress import progress_bar
+from liex_lab.runtime.progress import logged, progress_bar
 
 # exit code of internal errors (EX_SOFTWARE); errors that the user can correct are 1, usage errors 2
 FAULT = 70
@@ -159,7 +159,8 @@ def run(
 ) -> None:
     """Measure a recording: write poses, behaviour tables, a replay and a report.
 
-    The last line is the verdict; exits with code 4 if the session needs review.
+    The last line is the verdict; exits with code 4 if the session needs review. What was done is
+    logged in NAME.log beside the session.
     Several arenas in one image (`[[arenas]]` of the plan, or --set arenas=auto) become one session
     each, and so do several animals in one arena (--set animal.count=2, or auto).
     """
@@ -170,7 +171,9 @@ def run(
     chosen = load_plan(plan, asked)
     alone = chosen.arenas is None and chosen.animal.count == 1
     measure = api.run_session if alone else api.run_arenas
-    with progress_bar() as progress:
+    log = durable.inside(out, Path(recordings[0]).stem or "recording", ".log")
+    title = f"liex_lab {liex_lab.__version__}: liex {shlex.join(sys.argv[1:])}"
+    with progress_bar() as bar, logged(bar, log, title) as progress:
         measured = measure(
             as_one(recordings),
             chosen if plan else None,

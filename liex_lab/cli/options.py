@@ -277,7 +277,7 @@ def command_group(help: str, name: str | None = None) -> typer.Typer:
         help=help,
         cls=SectionedGroup,
         no_args_is_help=True,
-        add_completion=False,
+        add_completion=name is not None,  # --install-completion of the program
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )

@@ -7,6 +7,8 @@ shows it to the user.
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
 from typing import Protocol
 
 from liex_lab.errors import printable
@@ -73,6 +75,46 @@ def progress_bar() -> Iterator[Progress]:
             display.update(task, completed=done, total=total, description=printable(what))
 
         yield report
+
+
+@contextmanager
+def logged(progress: Progress, path: Path, title: str) -> Iterator[Progress]:
+    """The same progress, which within the block also appends its stages to a log.
+
+    Each stage is a line with its time, and each tenth of a long one; the last line is the error
+    that ended it, or "done". A job that ends before its first stage leaves no log.
+
+    Args:
+        progress: receives the reports.
+        path: of the log, UTF-8 text; its folder is made.
+        title: first line, such as the command.
+    """
+    last = ("", 0)
+
+    def line(text: object) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        now = datetime.now().astimezone().isoformat(timespec="seconds")
+        with path.open("a", encoding="utf-8") as file:
+            file.write(f"{now} {printable(text)}\n")
+
+    def report(done: int, total: int | None, what: str) -> None:
+        nonlocal last
+        reached = (what, 10 * done // total if total else 0)
+        if reached != last:
+            if not last[0]:
+                line(title)
+            last = reached
+            line(f"{what}: {done} of {total}" if total else what)
+        progress(done, total, what)
+
+    try:
+        yield report
+    except BaseException as error:
+        if last[0]:
+            line(f"ended: {error or type(error).__name__}")
+        raise
+    if last[0]:
+        line("done")
 
 
 COMPILING = "compiling, once on this machine: a minute or two"

@@ -8,6 +8,7 @@ from typing import Any
 
 from liex_lab.dashboards.app.data import StudyData
 from liex_lab.dashboards.app.server import make_app, serve
+from liex_lab.pipelines.bench import Bench
 from liex_lab.pipelines.region_config import StatedRegions
 from liex_lab.pipelines.study.run import list_sessions
 
@@ -20,14 +21,16 @@ class Served:
     def __init__(self, study: Path, **more: Any) -> None:
         self.study, self.began = study, time.monotonic()
         self.asked: list[tuple[Path, float]] = []
+        place = study if study.is_dir() else study.parent
         data = StudyData(*list_sessions(study))
         data.warm()
         app = make_app(
             data,
             show_replay=lambda replay, at_s: self.asked.append((replay, at_s)),
             correct=partial(correct_session, report=False),
-            reviews=(study if study.is_dir() else study.parent) / "reviews",
+            reviews=place / "reviews",
             regions=StatedRegions(study),
+            measuring=Bench(place.resolve()),
             **more,
         )
         ready = threading.Event()
