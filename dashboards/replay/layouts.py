@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -195,5 +196,14 @@ def foxglove_layout(about: dict[str, Any]) -> dict[str, Any]:
             "color": colour,
         }
         for j, colour in zip(ends, ("#4477aa", "#ee6677"), strict=False)
+    ]
+    names = (about.get("interactions") or {}).get("individuals", ())
+    panels["StateTransitions!actions"]["paths"] += [
+        {
+            "value": f'/interactions{{agent=="{agent}"}}{{target=="{target}"}}.interactions',
+            "label": f"{agent} to {target}",
+            "timestampMethod": "receiveTime",
+        }
+        for agent, target in permutations(names, 2)
     ]
     return layout

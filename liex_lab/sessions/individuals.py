@@ -94,13 +94,19 @@ class OtherAnimal:
         name: of the animal.
         colour: 0xRRGGBB.
         joints_mm: (n, J, 3) arena frame; NaN without a pose.
-        uv_px: (n, J, 2) px of the depth image.
+        origin: the session's camera.
     """
 
     name: str
     colour: int
     joints_mm: NDArray[np.float64]
-    uv_px: NDArray[np.float64]
+    origin: Provenance
+
+    def uv_px(self, rows: slice) -> NDArray[np.float64]:
+        """The joints (m, J, 2) of some frames, px of the depth image."""
+        return self.origin.camera.project(
+            self.origin.T_arena_camera.inverse() @ self.joints_mm[rows]
+        )
 
 
 def in_replay(
@@ -111,11 +117,8 @@ def in_replay(
         return None, []
     colours = individual_colours([one.name for one in together.animals])
     numbers = {name: int(colour[1:], 16) for name, colour in colours.items()}
-    into = origin.T_arena_camera.inverse()
     others = [
-        OtherAnimal(
-            one.name, numbers[one.name], one.joints_mm, origin.camera.project(into @ one.joints_mm)
-        )
+        OtherAnimal(one.name, numbers[one.name], one.joints_mm, origin)
         for one in together.animals
         if one.name != origin.individual
     ]

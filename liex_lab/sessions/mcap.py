@@ -453,6 +453,7 @@ class McapWriter:
     def _log_track(self, track: Track, others: Sequence[OtherAnimal], part: slice) -> None:
         """Skeletons and transforms of some frames, of others those of the rows `part`."""
         posed = track.posed
+        placed = [(one, one.joints_mm[part], one.uv_px(part)) for one in others]
         quaternions = so3.quaternion(np.where(posed[:, None, None], track.root_rotation, np.eye(3)))
         for i, time_ns in enumerate(track.times_ns.tolist()):
             joints_m = track.joints_mm[i] / 1000.0
@@ -460,11 +461,10 @@ class McapWriter:
             bodies: list[_Body] = [
                 ("skeleton", joints_m, track.uv_px[i], found, self._bone, self._joint)
             ]
-            for one in others:
-                own = one.joints_mm[part.start + i] / 1000.0
-                there, colour = bool(np.isfinite(own).all()), _colour(one.colour)
-                uv = one.uv_px[part.start + i]
-                bodies.append((f"skeleton of {one.name}", own, uv, there, colour, colour))
+            for one, joints, uv in placed:
+                there, colour = bool(np.isfinite(joints[i]).all()), _colour(one.colour)
+                name = f"skeleton of {one.name}"
+                bodies.append((name, joints[i] / 1000.0, uv[i], there, colour, colour))
             scene = self._scene_update(time_ns, bodies)
             self._log_message("/skeleton/scene", time_ns, scene)
             joints = messages.PosesInFrame(

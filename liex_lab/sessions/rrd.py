@@ -504,7 +504,7 @@ def _other_columns(
     other: OtherAnimal, skeleton: Skeleton, part: slice
 ) -> Iterator[tuple[str, Any]]:
     """Joints and bones of another animal of the arena; empty without a pose."""
-    joints, uv_px = other.joints_mm[part], other.uv_px[part]
+    joints, uv_px = other.joints_mm[part], other.uv_px(part)
     posed = np.asarray(np.isfinite(joints).all(axis=(1, 2)))
     yield from _chain_columns(_entities_of(other.name), skeleton, posed, joints, uv_px)
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from liex_lab.dashboards.replay.layouts import foxglove_layout
 from mcap.reader import make_reader
 
 from liex_lab.sessions import rrd
@@ -50,3 +51,5 @@ def test_foxglove_shows_both_and_a_message_at_each_change(pair):
         pairs = first.interactions.query("agent == @state['agent'] and target == @state['target']")
         assert sorted(filter(None, state["interactions"].split(", "))) == words_at(pairs, frame)
     assert told
+    lanes = foxglove_layout(first.metadata)["configById"]["StateTransitions!actions"]["paths"]
+    assert [lane["label"] for lane in lanes[1:]] == ["animal1 to animal2", "animal2 to animal1"]
