@@ -461,10 +461,10 @@ class McapWriter:
             bodies: list[_Body] = [
                 ("skeleton", joints_m, track.uv_px[i], found, self._bone, self._joint)
             ]
-            for one, joints, uv in placed:
-                there, colour = bool(np.isfinite(joints[i]).all()), _colour(one.colour)
+            for one, own, uv in placed:
+                there, colour = bool(np.isfinite(own[i]).all()), _colour(one.colour)
                 name = f"skeleton of {one.name}"
-                bodies.append((name, joints[i] / 1000.0, uv[i], there, colour, colour))
+                bodies.append((name, own[i] / 1000.0, uv[i], there, colour, colour))
             scene = self._scene_update(time_ns, bodies)
             self._log_message("/skeleton/scene", time_ns, scene)
             joints = messages.PosesInFrame(
