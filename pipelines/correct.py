@@ -394,7 +394,7 @@ def _synchronise(raw: Session, log: corrections.Log, folder: Path) -> correction
             "session_id": raw.name,
             "individual": raw.metadata["individual"],
             "event": np.array(names, object),
-            "time_s": (clock.time_ns(times) - first_ns) * 1e-9,
+            "time_s": clock.since(first_ns, times),
             "sync_s": np.array(times),
         }
         schema.write_table(folder / "events.parquet", schema.EVENTS, [rows], {})

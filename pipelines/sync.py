@@ -173,4 +173,5 @@ def _record(found: Alignment, own_s: Array, time_ns: Any, name: str, source: str
         tuple(
             (round(float(times[k]), 6), round(1e3 * float(found.residual_s[k]), 4)) for k in rows
         ),
+        breaks=clock.breaks,
     )

@@ -133,7 +133,7 @@ def align(own_s: Any, other_s: Any, stated_s: Any = ()) -> Alignment:
             half the usual interval of events. Without any, the pattern of intervals decides.
 
     Raises:
-        SyncError: the trains fit nowhere or in several ways, or a clock jumps.
+        SyncError: the trains fit nowhere or in several ways, or a clock jumps and a part does.
     """
     x, y = check_times(own_s, "the session's events"), check_times(other_s, "the other file")
     stated = np.reshape(np.asarray(stated_s, float), (-1, 2))
@@ -153,15 +153,15 @@ def align(own_s: Any, other_s: Any, stated_s: Any = ()) -> Alignment:
     best = _matched(x, y, _fit(*_events(x, y, _matched(x, y, best.clock, tight))), tight)
     for other in (_matched(x, y, one.clock, tight) for one in others):
         compared = min(other.n_overlapping) >= 0.5 * min(best.n_overlapping)
-        if compared and _p_alike(best, other) > _SURE:
+        if compared and _p_alike(best, other) > _SURE and not _apart(best, other):
             shift = float(np.median(other.clock(x) - best.clock(x)))
             raise SyncError(
                 f"the events fit in more than one way: {best.share:.1%} of them agree, and "
                 f"{other.share:.1%} if shifted by {shift:.3f} s; state that the first events are "
                 "the same (--first) or pairs of times (--pairs), or record random intervals"
             )
-    if len(best.pairs) >= _FEWEST:
-        _refuse_jump(x, y, best)
+    if len(best.pairs) >= _FEWEST and (stretch := _unlike(best, len(y))):
+        return _across(x, y, best, stated, *stretch)
     if len(best.pairs) < _FEWEST or best.share < 0.5:
         raise SyncError(
             f"the events fit nowhere: at best {len(best.pairs)} of {len(x)} and {len(y)} agree; "
@@ -453,22 +453,96 @@ def _solved(x: Array, y: Array, n: int) -> tuple[ClockMap, float]:
     return ClockMap(knots, knots - middle_x + middle_y + values, sd), square
 
 
-def _refuse_jump(x: Array, y: Array, best: Alignment) -> None:
-    """Refuse trains that agree up to a moment, and not at all in a stretch of many events.
+def _apart(one: Alignment, other: Alignment) -> bool:
+    """Whether two alignments match events of different parts of the session, as after a jump."""
+    a, b = (np.quantile(each.pairs[:, 0], (0.05, 0.95)) for each in (one, other))
+    return bool(a[1] < b[0] or b[1] < a[0])
 
-    Raises:
-        SyncError: a clock jumps.
+
+def _unlike(best: Alignment, n_others: int) -> tuple[int, int] | None:
+    """First and last of many successive events of ours that agree with none, while others do.
+
+    A few may agree by chance.
     """
     rows = np.flatnonzero(best.inside[0])
-    edges = np.concatenate([[rows[0] - 1], best.pairs[:, 0], [rows[-1] + 1]])
-    k = int(np.argmax(np.diff(edges)))
-    first, last = int(edges[k]) + 1, int(edges[k + 1]) - 1
-    n = last - first + 1
-    start, stop = best.clock(x[[first, max(first, last)]])
-    theirs = int(((y >= start) & (y <= stop)).sum())
-    elsewhere = sum(best.n_overlapping) - n - theirs
-    if min(n, theirs) >= _FEWEST and 2 * len(best.pairs) >= 0.7 * elsewhere:
+    agree = np.isin(rows, best.pairs[:, 0])
+    begin, end, excess = _longest(np.where(agree, -4, 1))
+    alike = _longest(np.where(agree, 1, -2))[2]
+    if min(excess, alike) < _FEWEST:
+        return None
+    first, last = int(rows[begin]), int(rows[end - 1])
+    before, after = _edges(best, first, last, n_others)
+    return (first, last) if after - before >= _FEWEST else None
+
+
+def _longest(gain: Rows) -> tuple[int, int, int]:
+    """The stretch (start, stop) with the largest sum, and the sum (maximum subarray)."""
+    total = np.concatenate([[0], np.cumsum(gain)])
+    least = np.minimum.accumulate(total)
+    end = int(np.argmax(total - least))
+    return int(np.flatnonzero(total[: end + 1] == least[end])[-1]), end, int(max(total - least))
+
+
+def _edges(best: Alignment, first: int, last: int, n_others: int) -> tuple[int, int]:
+    """The span (start, stop) of the other events between those matched around a stretch of ours."""
+    ours, others = best.pairs.T
+    before, after = others[ours < first], others[ours > last]
+    return int(before[-1]) + 1 if len(before) else 0, int(after[0]) if len(after) else n_others
+
+
+def _across(x: Array, y: Array, best: Alignment, stated: Array, first: int, last: int) -> Alignment:
+    """The alignment in parts of trains between which a clock jumps at a stretch of our events.
+
+    Raises:
+        SyncError: a part cannot be aligned by itself.
+    """
+    b, d = _edges(best, first, last, len(y))
+    # all events at an end belong to the stretch
+    a, c = first if b else 0, last + 1 if d < len(y) else len(x)
+    parts = [
+        (slice(0, a), slice(0, b)),
+        (slice(a, c), slice(b, d)),
+        (slice(c, None), slice(d, None)),
+    ]
+    pieces: list[Rows] = []
+    inside: list[tuple[Mask, Mask]] = []
+    try:
+        for ours, others in (part for part in parts if len(x[part[0]])):
+            own = x[ours]
+            among = (stated[:, 0] >= own[0]) & (stated[:, 0] <= own[-1])
+            found = align(own, y[others], stated[among])
+            starts = found.clock.own_s[list(found.clock.breaks)]
+            number = np.searchsorted(starts, own[found.pairs[:, 0]], side="right")
+            rows = found.pairs + np.array([ours.start, others.start])
+            pieces += [_supported(rows[number == k]) for k in range(len(starts) + 1)]
+            inside.append(found.inside)
+        refuse(SyncError, (min(map(len, pieces)) < _FEWEST, "a part has too few events"))
+    except SyncError as error:
         raise SyncError(
-            f"a clock jumps: from {x[first]:.3f} to {x[last]:.3f} s of the session {n} events fit "
-            f"none of the {theirs} there, although others fit; split the recording there"
-        )
+            f"a clock jumps: from {x[first]:.3f} to {x[last]:.3f} s of the session "
+            f"{last - first + 1} events do not fit, although others do, and the parts cannot be "
+            f"aligned separately ({error}); split the recording there"
+        ) from None
+    clocks = [_fit(x[rows[:, 0]], y[rows[:, 1]]) for rows in pieces]
+    breaks = np.cumsum([len(one.own_s) for one in clocks])[:-1]
+    clock = ClockMap(
+        np.concatenate([one.own_s for one in clocks]),
+        np.concatenate([one.other_s for one in clocks]),
+        np.concatenate([one.sd_s for one in clocks]),
+        tuple(breaks.tolist()),
+    )
+    pairs = np.concatenate(pieces)
+    ours_in, others_in = (np.concatenate(masks) for masks in zip(*inside, strict=True))
+    residual = y[pairs[:, 1]] - clock(x[pairs[:, 0]])
+    return Alignment(clock, pairs, residual, (ours_in, others_in))
+
+
+def _supported(pairs: Rows) -> Rows:
+    """Pairs without those at the ends of a part that may agree by chance.
+
+    The last one kept is the third of four successive events that agree, on either side.
+    """
+    if len(pairs) < 3:
+        return pairs[:0]
+    dense = np.flatnonzero((pairs[2:] - pairs[:-2] <= 3).all(axis=1))
+    return pairs[dense[0] : dense[-1] + 3] if len(dense) else pairs[:0]

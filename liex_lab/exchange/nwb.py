@@ -100,21 +100,30 @@ def _intervals(
     return table
 
 
-def _interactions(session: Session) -> Any:
-    """What the animals of the arena did to each other; None for one animal."""
-    if not session.has("interactions.parquet"):
-        return None
-    found = session.interactions
-    described = session.columns.query("table == 'interactions'").set_index("name")["meaning"]
-    return _intervals(
-        "interactions",
+_LISTED = {  # further tables of a session: description, times, columns
+    "interactions": (
         "what one animal of the arena did to another: half-open intervals",
-        found[["start_s", "stop_s"]].to_numpy(float),
-        **{
-            name: (str(described[name]), found[name].tolist())
-            for name in ("agent", "target", "action", "score", "directed")
-        },
-    )
+        ["start_s", "stop_s"],
+        ("agent", "target", "action", "score", "directed"),
+    ),
+    "events": ("events of another instrument", ["time_s", "time_s"], ("event", "sync_s")),
+    "triggers": (
+        "events of rules in the live recording",
+        ["time_s", "time_s"],
+        ("rule", "outcome", "value", "latency_ms"),
+    ),
+}
+
+
+def _listed(session: Session, name: str) -> Any:
+    """A table of `_LISTED` as intervals, without rows whose time is unknown; None if absent."""
+    if not session.has(f"{name}.parquet"):
+        return None
+    what, times, columns = _LISTED[name]
+    found = session.table(name).dropna(subset=times)
+    described = session.columns.query("table == @name").set_index("name")["meaning"]
+    held = {one: (str(described[one]), found[one].tolist()) for one in columns}
+    return _intervals(name, what, found[times].to_numpy(float), **held)
 
 
 def _in_one_arena(session: Session) -> dict[str, str]:
@@ -225,8 +234,8 @@ def build(session: Session) -> pynwb.NWBFile:
     )
     when = "when actions could be named"
     observed = _intervals("observed", when, observed_spans(poses)) if len(gaps) else None
-    together = _interactions(session)
-    for table in (_actions(session, estimate, catalogue, observed), gaps, observed, together):
+    listed = (_listed(session, name) for name in _LISTED)
+    for table in (_actions(session, estimate, catalogue, observed), gaps, observed, *listed):
         if table is not None and len(table):
             made.add_time_intervals(table)
     return made

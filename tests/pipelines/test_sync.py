@@ -112,6 +112,41 @@ def test_frames_are_pulses_when_the_first_one_is_stated(session: Session, tmp_pa
     np.testing.assert_allclose(frames["sync_s"], other_clock(frames["time_s"]), atol=1e-5)
 
 
+def test_a_clock_that_jumps_leaves_a_gap_and_events_go_to_nwb(
+    session: Session, tmp_path: Path
+) -> None:
+    ours = np.cumsum(RNG.uniform(0.15, 0.45, 26))
+    pd.DataFrame({"time_s": ours}).to_csv(tmp_path / "ours.csv", index=False)
+    middle = float(ours[12:14].mean())
+    np.save(tmp_path / "ephys.npy", other_clock(ours) + 5.0 * (ours > middle))
+    rewards = np.array([1.0, middle + 0.01, 7.0])
+    stated = pd.DataFrame(
+        {"event": "reward", "time_s": other_clock(rewards) + np.array([0, 2.5, 5])}
+    )
+    stated.to_csv(tmp_path / "rewards.csv", index=False)
+    fit = sync_session(
+        session.path,
+        tmp_path / "ephys.npy",
+        pulses=tmp_path / "ours.csv",
+        events=tmp_path / "rewards.csv",
+        report=False,
+    )
+    assert len(fit.breaks) == 1
+    assert "a clock jumps" in str(fit)
+    synced = Session.open(session.path)
+    frames = synced.frames
+    wanted = other_clock(frames["time_s"]) + 5.0 * (frames["time_s"] > middle)
+    known = frames["sync_s"].notna()
+    np.testing.assert_allclose(frames["sync_s"][known], wanted[known], atol=1e-4)
+    assert 1 <= (~known).sum() < 30
+    assert (frames["time_s"][~known] - middle).abs().max() < 1.0
+    np.testing.assert_allclose(synced.table("events")["time_s"], [1.0, np.nan, 7.0], atol=1e-4)
+    with pynwb.NWBHDF5IO(export(synced, "nwb", tmp_path), "r") as file:
+        table = file.read().intervals["events"].to_dataframe()
+    np.testing.assert_allclose(table["start_time"], [1.0, 7.0], atol=1e-4)
+    assert set(table["event"]) == {"reward"}
+
+
 def test_stated_pairs_suffice(session: Session, tmp_path: Path) -> None:
     (tmp_path / "pairs.csv").write_text("time_s;other_s\n1,0;11,0\n7,0;17,0\n")
     assert sync_session(session.path, pairs=tmp_path / "pairs.csv", report=False).sd_s is None
