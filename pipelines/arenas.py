@@ -273,8 +273,7 @@ def _measure_animals(
                 progress(frames[-1].index + 1, len(shared), MEASURING)
         whole = [writer.observations(Observations) for writer in writers]
         subjects = [prepared.fitted.tracker.subject for prepared in going.values()]
-        areas = [prepared.fitted.tracker.scene.area_mm2 for prepared in going.values()]
-        identity = identify(whole, subjects, areas, readings)
+        identity = identify(whole, subjects, readings)
         for k, (prepared, writer) in enumerate(zip(going.values(), writers, strict=True)):
             if readings is not None:
                 prepared.mark(writer, identity, k)

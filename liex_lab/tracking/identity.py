@@ -33,6 +33,7 @@ CERTAIN = 0.9  # least certainty for statistics per animal
 _SIZE_SD = 0.15  # of the logarithm of an animal's pixels, from posture to posture
 _GAP_S = 0.1  # time without all animals in view over which they are continued
 _VELOCITY_S = 0.2  # time over which their velocity is measured
+_STRETCH_SD = 0.04  # that of its mean over a stretch, of 0.015 of virtual mice
 _PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
 _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
@@ -64,15 +65,13 @@ class Identity:
 def identify(
     observed: Sequence[Observations],
     subjects: Sequence[Subject],
-    areas_mm2: Sequence[float],
     readings: Readings | None = None,
 ) -> Identity:
     """Assign the components of every frame to the animals.
 
     Args:
-        observed: for each animal, all frames measured with its body.
+        observed: for each animal, the largest first, all frames measured with its body.
         subjects: the animals.
-        areas_mm2: their usual areas.
         readings: RFID readings; None without any.
     """
     n_animals = len(observed)
@@ -89,9 +88,10 @@ def identify(
         )
         # cost (m - 1, S, S) of going from one assignment to another
         transition = moves[:, states[:, None, :], states[None, :, :]].sum(axis=-1)
-        sizes = emission = _sizes(observed[0][full], np.array(areas_mm2), states)
-        path, _ = _viterbi(transition, emission)
+        path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
         _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
+        path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
+        sizes = emission = _sizes(observed[0][full], states[path], states)
         path, _ = _viterbi(transition, emission)
         if readings is not None:
             places = observed[0].centroid_mm[full, ::2, :2].astype(float)
@@ -289,16 +289,40 @@ def _velocity(own: Array, seconds: Array, t: int, side: int) -> Array:
     return np.asarray(np.tensordot(since, own[rows], 1) / max(float(since @ since), 1e-9))
 
 
-def _sizes(observed: Observations, areas_mm2: Array, states: Slots) -> Array:
-    """Cost (m, S) of each assignment by the sizes of the outlines, nats."""
-    apart = np.isfinite(observed.objects[..., 0]).sum(axis=1) >= len(areas_mm2)
+def _sizes(observed: Observations, path: Slots, states: Slots) -> Array:
+    """Cost (m, S) of each assignment by the sizes of the outlines, nats.
+
+    The sizes of the animals, the largest first, are the means of the ordered sizes in the stretches
+    in which all stand apart. One stretch errs alike throughout, by postures and places, so that its
+    evidence has a limit, and of sizes that differ little the order is chance:
+
+        cost = sum_k (x_k - u_k)^2 / (2 s^2) / (1 + n t^2 / s^2),
+        u = shrunk by sqrt(1 - t^2 / (2 var u)), n: independent outlines of the stretch.
+
+    Args:
+        observed: the m frames that show all animals.
+        path: (m, N) an assignment of their components.
+        states: (S, N) the assignments.
+    """
+    n_animals = states.shape[1]
+    apart = np.isfinite(observed.objects[..., 0]).sum(axis=1) >= n_animals
     size = np.log(np.maximum(observed.n_px[:, ::2], 1))
     size -= size.mean(axis=1, keepdims=True)
-    usual = np.log(areas_mm2) - np.log(areas_mm2).mean()
-    off = ((size[:, states] - usual) / _SIZE_SD) ** 2
+    own = np.take_along_axis(size, path, axis=1)
     step_s = np.diff(observed.seconds, prepend=observed.seconds[0] - _INDEPENDENT_S)
-    weight = apart * np.minimum(step_s / _INDEPENDENT_S, 1.0)
-    return np.asarray(0.5 * weight[:, None] * np.minimum(off.sum(axis=-1), 18.0))
+    weight = np.minimum(step_s / _INDEPENDENT_S, 1.0)
+    usual, total = np.zeros(n_animals), 1e-9
+    shared = (_STRETCH_SD / _SIZE_SD) ** 2
+    for start, stop in spans(apart):
+        rows = slice(start, stop)
+        n = float(weight[rows].sum())
+        weight[rows] /= 1.0 + n * shared
+        usual += n / (1.0 + n * shared) * np.sort(own[rows].mean(axis=0))[::-1]
+        total += n / (1.0 + n * shared)
+    usual /= total
+    usual *= np.sqrt(max(0.0, 1.0 - 0.5 * _STRETCH_SD**2 / max(float(usual.var()), 1e-9)))
+    off = ((size[:, states] - usual) / _SIZE_SD) ** 2
+    return np.asarray(0.5 * (weight * apart)[:, None] * np.minimum(off.sum(axis=-1), 18.0))
 
 
 def _viterbi(transition: Array, emission: Array) -> tuple[Slots, float]:

@@ -54,7 +54,7 @@ def named(order: np.ndarray, slots: np.ndarray) -> np.ndarray:
 def test_each_animal_keeps_its_name_in_whatever_order_components_come(n_animals: int) -> None:
     order = shuffled(n_animals)
     seen = mixed(n_animals, order)
-    found = identify([seen] * n_animals, [SUBJECT] * n_animals, [2000.0] * n_animals)
+    found = identify([seen] * n_animals, [SUBJECT] * n_animals)
     names = named(order, found.slots)
     assert (names == names[0]).all()
     assert all(one.p_swap < 0.01 for one in found.crossings)
@@ -67,7 +67,7 @@ def test_a_frame_that_shows_one_of_two_belongs_to_the_one_that_is_near() -> None
     seen = mixed(2, order)
     for name in POSE[:-2]:
         getattr(seen, name)[40, 2:] = np.nan
-    slots = identify([seen] * 2, [SUBJECT] * 2, [2000.0] * 2).slots
+    slots = identify([seen] * 2, [SUBJECT] * 2).slots
     assert sorted(slots[40]) == [-1, 0]
     near = int(np.flatnonzero(slots[40] == 0)[0])
     assert order[40, 0] == order[39, slots[39, near]]
@@ -82,7 +82,7 @@ def test_an_animal_that_enters_leaves_or_hides_does_not_take_the_name_of_the_oth
     for name in POSE[:-2]:
         getattr(seen, name)[away, 2:] = np.nan  # the second one
     seen.n_px[away, 2:] = 0
-    found = identify([seen] * 2, [SUBJECT] * 2, [2000.0] * 2)
+    found = identify([seen] * 2, [SUBJECT] * 2)
     first = int(np.flatnonzero(found.slots[(found.slots == 1).any(axis=1)][0] == 0)[0])
     sure = np.ones(len(SECONDS), bool)
     for one in found.crossings:
@@ -92,7 +92,7 @@ def test_an_animal_that_enters_leaves_or_hides_does_not_take_the_name_of_the_oth
     assert (found.slots[away, 1 - first] == -1).all() or not sure[away].all()
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1.5])
+@pytest.mark.parametrize("ratio", [1.0, 1.04, 1.15, 1.5])
 def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_it(
     ratio: float,
 ) -> None:
@@ -105,10 +105,9 @@ def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_i
     seen.place[:] = middle + apart[:, None, None] * (seen.place - middle)
     seen.centroid_mm[:] = seen.place
     seen.n_px[:, :2] = round(800 * ratio)
-    areas = [2000.0 * ratio, 2000.0]
-    found = identify([seen] * 2, [SUBJECT] * 2, areas)
+    found = identify([seen] * 2, [SUBJECT] * 2)
     unclear = max(found.crossings, key=lambda one: one.p_swap)
-    if ratio == 1.0:
+    if ratio < 1.1:  # it may be by chance
         assert 0.2 < unclear.p_swap <= 0.5
         assert "may have been exchanged at 1 of" in doubt(found.crossings)
     else:
@@ -130,7 +129,7 @@ def test_how_smoothly_bodies_fit_does_not_exchange_animals_in_a_long_contact() -
     jitters, smooth = (touching(mixed(2, order), rows) for _ in range(2))
     jitters.place[rows, :2] += rng.normal(0.0, 4.0, (60, 1, 3))  # each body on its own animal
     smooth.place[rows, 2:4] += rng.normal(0.0, 4.0, (60, 1, 3))
-    slots = identify([jitters, smooth], [SUBJECT] * 2, [2000.0] * 2).slots
+    slots = identify([jitters, smooth], [SUBJECT] * 2).slots
     assert (slots == slots[0]).all()
 
 

@@ -46,29 +46,29 @@ def unclear() -> tuple:
     shown.place[:] = middle + apart[:, None, None] * (shown.place - middle)
     shown.centroid_mm[:] = shown.place
     shown.place[LOST] = shown.centroid_mm[LOST] = np.nan
-    return [shown] * 2, [SUBJECT] * 2, [2000.0] * 2
+    return [shown] * 2, [SUBJECT] * 2
 
 
 def spread() -> tuple:
     """The same animals farther apart, so that antennas distinguish them."""
-    shown, subjects, areas = unclear()
+    shown, subjects = unclear()
     away = np.array([[-200.0, 0, 0], [200.0, 0, 0]], np.float32).repeat(2, axis=0)
     late = np.clip(np.abs(np.arange(N) - 47.0) - 8.0, 0.0, 20.0)[:, None, None] / 20.0
     for one in (shown[0].place, shown[0].centroid_mm):
         one[:, :4] += (late * away).astype(np.float32)
-    return shown, subjects, areas
+    return shown, subjects
 
 
 @pytest.mark.parametrize("crossed", [False, True])
 def test_readings_after_a_crossing_decide_which_is_which(crossed: bool) -> None:
-    shown, subjects, areas = spread()
-    before = identify(shown, subjects, areas)
+    shown, subjects = spread()
+    before = identify(shown, subjects)
     assert max(one.p_swap for one in before.crossings) > 0.1
     rows, slots = np.array([5, 12, 75, 85]), np.array([0, 1, 0, 1])
     tags = np.array([0, 1, *([1, 0] if crossed else [0, 1])])
     places = shown[0].centroid_mm[rows, 2 * slots, :2]
     readings = Readings(TAGS, tags, SECONDS[rows], np.column_stack([places, np.full(4, 30.0)]))
-    found = identify(shown, subjects, areas, readings)
+    found = identify(shown, subjects, readings)
     ada = found.tags.index("ada")
     assert (found.slots[: LOST.start, ada] == 0).all()
     assert (found.slots[LOST.stop :, ada] == int(crossed)).all()
@@ -79,29 +79,29 @@ def test_readings_after_a_crossing_decide_which_is_which(crossed: bool) -> None:
 
 
 def test_readings_where_no_animal_is_change_nothing_and_are_reported() -> None:
-    shown, subjects, areas = spread()
-    before = identify(shown, subjects, areas)
+    shown, subjects = spread()
+    before = identify(shown, subjects)
     nowhere = np.tile([900.0, 900.0, 30.0], (6, 1))
     readings = Readings(TAGS, np.array([0, 1] * 3), SECONDS[[5, 12, 20, 75, 80, 85]], nowhere)
-    found = identify(shown, subjects, areas, readings)
+    found = identify(shown, subjects, readings)
     np.testing.assert_array_equal(found.slots, before.slots)
     assert found.crossings == before.crossings
     assert found.misfits[0].startswith("at 6 of 6 RFID readings the animal is not at the antenna")
     assert found.tags == ()
     wide = np.tile([0.0, 0.0, 2000.0], (2, 1))  # both animals are within its range
     readings = Readings(TAGS, np.array([0, 1]), SECONDS[[5, 12]], wide)
-    found = identify(shown, subjects, areas, readings)
+    found = identify(shown, subjects, readings)
     assert found.tags == ()
     assert "2 RFID readings do not distinguish the animals" in found.misfits[0]
 
 
 def test_one_wrong_reading_does_not_exchange_animals_that_stay_apart() -> None:
-    shown, subjects, areas = spread()
+    shown, subjects = spread()
     rows, slots = np.array([5, 12, 20, 30]), np.array([0, 1, 0, 0])
     places = shown[0].centroid_mm[rows, 2 * slots, :2]
     antennas = np.column_stack([places, np.full(4, 30.0)])
     readings = Readings(TAGS, np.array([0, 1, 0, 1]), SECONDS[rows], antennas)
-    found = identify(shown, subjects, areas, readings)
+    found = identify(shown, subjects, readings)
     assert (found.slots[:30, found.tags.index("ada")] == 0).all()
     assert found.remarks == ("at 1 of 4 RFID readings the animal is not at the antenna",)
 
