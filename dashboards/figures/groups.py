@@ -43,7 +43,7 @@ from .style import (
     sheet,
     time_unit,
 )
-from .times import walked
+from .times import around_events, walked
 
 NO_GROUP = "no group"
 
@@ -211,6 +211,45 @@ def distance_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
     axes.set(xlim=(0.0, duration / size), ylim=(0.0, None))
     axes.grid(color=LINE, linewidth=0.4)
     axes.legend(loc="upper left")
+    return figure
+
+
+def events_by_group(animals: Sequence[SessionAnimal]) -> Figure | None:
+    """Measures around events of another instrument: every subject, and each group's mean.
+
+    A subject's curve is the mean of its sessions' medians; None without five events of a name.
+    """
+    groups = by_group(animals)
+    found: dict[tuple[str, str, str], dict[str, list[Array]]] = {}
+    time_s = np.zeros(0)
+    for group, subjects in groups.items():
+        for sessions in subjects.values():
+            own: dict[tuple[str, str, str], list[Array]] = {}
+            for *key, one in (row for animal in sessions for row in around_events(animal)):
+                own.setdefault((key[0], key[1], key[2]), []).append(one.median)
+                time_s = one.time_s
+            for name, medians in own.items():
+                found.setdefault(name, {}).setdefault(group, []).append(np.mean(medians, axis=0))
+    if not found:
+        return None
+    line = 41.0 + 4.0 * len(groups)
+    figure = sheet(ONE_COLUMN_MM, line * len(found) + 6.0)
+    for k, ((title, unit, event), curves) in enumerate(found.items()):
+        at = 9.0 + line * (len(found) - 1 - k)
+        axes = panel(figure, 12.0, at, ONE_COLUMN_MM - 17.0, 30.0)
+        for group, some in curves.items():
+            colour = group_colour(group, list(groups))
+            for curve in some:
+                axes.plot(time_s, curve, color=colour, linewidth=0.5, alpha=0.5)
+            label = f"{group}, n = {counted(len(some), 'subject')}"
+            axes.plot(time_s, np.mean(some, axis=0), color=colour, linewidth=1.5, label=label)
+        axes.axvline(0.0, color=INK, linewidth=0.6, linestyle=(0, (3, 2)))
+        axes.set(xlim=(time_s[0], time_s[-1]), ylabel=f"{title.lower()}, {unit}")
+        axes.set(ylim=(0.0, None), xlabel="time from the event, s")
+        axes.set_title(event.replace("_", " "), size=6.5)
+        axes.grid(color=LINE, linewidth=0.4)
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    heading(figure, "About the events: subjects, and the mean")
     return figure
 
 

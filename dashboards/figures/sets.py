@@ -55,6 +55,7 @@ OF_STUDY: dict[str, tuple[str, Callable[[Sequence[SessionAnimal]], Figure | None
     "occupancy_groups": ("occupancy of every group", groups.occupancy_by_group),
     "time_budgets": ("shares of the actions, every subject", groups.budgets_by_group),
     "distances": ("cumulative distance, every session", groups.distance_by_group),
+    "events_groups": ("measures about events, every subject", groups.events_by_group),
 }
 
 

@@ -528,24 +528,33 @@ def _graph(axes: Axes, words: list[str], found: dict[str, Array], colours: dict[
 
 def aligned_curves(animal: SessionAnimal) -> Figure | None:
     """Median and quartiles of measures around the onsets of actions; None with too few bouts."""
-    about = "the onsets", "the bouts"
-    return _aligned(animal, animal.bouts, action_colours(animal.words), about)
+    colours = action_colours(animal.words)
+    rows = _onsets(animal, animal.bouts, list(colours))
+    return _aligned(animal, rows, colours, ("the onsets", "the bouts"))
 
 
 def event_curves(animal: SessionAnimal) -> Figure | None:
     """The same around events of another instrument; None with too few of each name."""
+    rows = around_events(animal)
+    colours = dict.fromkeys([word for _, _, word, _ in rows], BLUE)
+    return _aligned(animal, rows, colours, ("the events", "the events"))
+
+
+def around_events(animal: SessionAnimal) -> list[tuple[str, str, str, Around]]:
+    """Measure, unit, event and curves, in the displayed unit, of every event with enough of it."""
     events = animal.table("events")
     if events is None:
-        return None
-    colours = dict.fromkeys(events["event"].astype(str).unique()[:_MOST_EVENTS], BLUE)
+        return []
     named = events.rename(columns={"event": "action", "time_s": "start_s"})
-    return _aligned(animal, named, colours, ("the events", "the events"))
+    return _onsets(animal, named, list(named["action"].astype(str).unique()[:_MOST_EVENTS]))
 
 
 def _aligned(
-    animal: SessionAnimal, bouts: pd.DataFrame, colours: dict[str, str], about: tuple[str, str]
+    animal: SessionAnimal,
+    rows: list[tuple[str, str, str, Around]],
+    colours: dict[str, str],
+    about: tuple[str, str],
 ) -> Figure | None:
-    rows = _onsets(animal, bouts, list(colours))
     if not rows:
         return None
     side = (TWO_COLUMNS_MM - 4.0) / _BESIDE
@@ -569,7 +578,7 @@ def _aligned(
         axes.set_title(f"{word.replace('_', ' ')}, n = {one.n}", size=6.5)
         axes.set_ylabel(f"{title.lower()}, {unit}")
         if line == lines - 1 or k + _BESIDE >= len(rows):
-            axes.set_xlabel("time from the onset, s" if bouts is animal.bouts else "time, s")
+            axes.set_xlabel(f"time from {about[0][:-1]}, s")
     heading(figure, f"About {about[0]}, {animal.label}: median and quartiles over {about[1]}")
     return figure
 

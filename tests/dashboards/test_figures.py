@@ -22,6 +22,7 @@ from matplotlib.colors import to_hex
 
 from liex_lab.actions.vocabulary import action_colours
 from liex_lab.api import compare_groups, draw_figures
+from liex_lab.behaviour.activity import Around
 from liex_lab.errors import PlaceError, SessionError
 from liex_lab.scene.scene import Arena
 from liex_lab.sessions import Session
@@ -314,6 +315,26 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_curves_about_events_are_means_of_subjects_by_group(monkeypatch):
+    def around(animal: Any) -> list[Any]:
+        values = np.full(61, animal.speed)
+        return [
+            ("Speed", "cm/s", "tone", Around(np.linspace(-1, 2, 61), values, values, values, 9))
+        ]
+
+    monkeypatch.setattr(groups, "around_events", around)
+    stated = [("a", "m1", 10.0), ("a", "m1", 20.0), ("a", "m2", 35.0), ("b", "m3", 50.0)]
+    animals: Any = [SimpleNamespace(group=g, label=m, speed=v) for g, m, v in stated]
+    with drawing():
+        figure = groups.events_by_group(animals)
+    assert figure is not None
+    heights = [line.get_ydata()[0] for line in figure.axes[0].lines if len(line.get_xdata()) == 61]
+    assert heights == [15.0, 35.0, 25.0, 50.0, 50.0], "two subjects and their mean, then one"
+    assert "a, n = 2 subjects" in text_of(figure)
+    monkeypatch.setattr(groups, "around_events", lambda _: [])
+    assert groups.events_by_group(animals) is None
+
+
 @pytest.mark.slow
 def test_a_comparison_draws_every_animal_and_figures_no_longer_compared_are_removed(
     study, tmp_path
@@ -380,7 +401,7 @@ def test_the_mean_of_a_group_counts_every_subject_alike(study):
 
 def test_a_study_has_its_figures(study, tmp_path):
     found = draw_figures(study, formats=["svg"], out=tmp_path)
-    assert {path.stem for path in found["files"]} == set(sets.OF_STUDY)
+    assert {path.stem for path in found["files"]} == set(sets.OF_STUDY) - {"events_groups"}
     assert "n = 6 sessions" in (tmp_path / "ethograms.svg").read_text(encoding="utf-8")
 
 
