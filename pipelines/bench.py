@@ -99,7 +99,7 @@ class Bench:
                 )
             self._lines = []
             self._about = {"verb": verb, "at": at, "plan": plan}
-            log = self.place / f"{path.stem}.log"
+            log = durable.inside(self.place, path.stem, ".log")
             self._about["log"] = (log, log.stat().st_size if log.is_file() else 0)
             self._job = subprocess.Popen(
                 own_python("-m", "liex_lab", *words),

@@ -13,6 +13,7 @@ function show(state) {
   at("stages").textContent = state.stages.join("\n");
   at("stages").hidden = !state.stages.length;
   at("lines").textContent = state.lines.join("\n");
+  at("lines").hidden = !state.lines.length;
   at("stop").hidden = !state.running;
   at("done").hidden = state.running || state.verb !== "run";
 }
