@@ -55,7 +55,7 @@ def make_day(folder: Path, minutes: float, seed: int) -> int:
                     time_ns = _START_NS + number * STEP_NS
                     file.add(DepthFrame(number, time_ns, depth[row]))
                     number += 1
-                at += int(steps[-1])
+                at += 24 * bool(active)
     return number
 
 
