@@ -194,6 +194,8 @@ def frames_apart(times_ns: Times, step_ns: int) -> Times:
     dt = np.diff(times_ns)
     if rounded_step(times_ns):
         return _in_phase(times_ns, step_ns, 16)
+    if not (dt > GAP_FACTOR * step_ns).any():
+        return np.ones(len(dt), np.int64)
     # the median of jittering steps is off by 1 %, which is refined with longer and longer gaps
     period = float(step_ns)
     for longest in (1, *_LONGER):

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pandas as pd
@@ -33,6 +34,7 @@ from liex_lab.tracking.track import Crossing, Flip, Subject, Track
 Array = NDArray[np.float64]
 
 FILE = "observations.npz"
+_ROWS = 10_000  # written at once
 _ADDRESS = "synthetic:"
 
 
@@ -159,8 +161,14 @@ def write_evidence(folder: Path, observations: Observations, subject: Subject) -
         "n_measured": subject.n_measured,
     }
     columns = {name: getattr(observations, name) for name in COLUMNS}
-    text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
-    np.savez_compressed(folder / FILE, subject=text, **columns)
+    columns["subject"] = np.frombuffer(json.dumps(facts).encode(), np.uint8)
+    with ZipFile(folder / FILE, "w", ZIP_DEFLATED) as archive:  # as NumPy does, but in blocks
+        for name, values in columns.items():
+            header = {"descr": values.dtype.str, "fortran_order": False, "shape": values.shape}
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array_header_1_0(file, header)
+                for rows in memory.blocks(len(values), _ROWS):
+                    file.write(np.ascontiguousarray(values[rows]).tobytes())
 
 
 @contextmanager

@@ -209,15 +209,16 @@ class Rows:
         count = frame_count(self.frame_index)
         found = self._camera_gaps()
         observed = self.track.observed
-        flag = np.where(
-            np.isin(self.track.flag, NOT_FROM_CAMERA), self.track.flag, NOT_FROM_CAMERA[-1]
-        )
-        lost = np.where(observed, "", flag)
+        lost = np.full(len(time), len(NOT_FROM_CAMERA), np.uint8)
+        for k, name in enumerate(NOT_FROM_CAMERA[:-1], 1):
+            lost[self.track.flag == name] = k
+        lost[observed] = 0
         observed_rows = np.flatnonzero(observed)
         stops = stop_times(time)
-        for start, stop, reason in constant_runs(lost):
-            if not reason:
+        for start, stop, number in constant_runs(lost):
+            if not number:
                 continue
+            reason = NOT_FROM_CAMERA[int(number) - 1]
             span = (time[start], stops[stop - 1], int(count[start]), int(count[stop]))
             position = _NOWHERE
             if reason == HIDDEN and len(observed_rows):
@@ -225,7 +226,7 @@ class Rows:
                 last = max(0, int(np.searchsorted(observed_rows, start)) - 1)
                 x, y = self.track.centroid_mm[observed_rows[last], :2]
                 position = (float(x), float(y))
-            found.append((*span, stop - start, str(reason), *position))
+            found.append((*span, stop - start, reason, *position))
         found.sort()
         names = (*_SPAN_NAMES, "n_frames_missing", "reason", "x_mm", "y_mm")
         values: Iterable[Any] = zip(*found, strict=True) if found else ([] for _ in names)

@@ -55,12 +55,15 @@ def make_day(folder: Path, minutes: float, seed: int) -> int:
                     time_ns = _START_NS + number * STEP_NS
                     file.add(DepthFrame(number, time_ns, depth[row]))
                     number += 1
-                at += int(steps[-1])
+                at += 24 * bool(active)
     return number
 
 
 def measure(folder: Path, minutes: float, kill_after_s: float) -> dict[str, Any]:
-    """`liex run` on the day's files, killed once and run again, with its memory every 5 s."""
+    """`liex run` on the day's files, killed once and run again, with its memory every 5 s.
+
+    The first run is killed some seconds after its first checkpoint.
+    """
     off_h, off_min = divmod(round(7 * 60 + minutes / 2), 60)
     light = ("light.on=07:00", f"light.off={off_h:02}:{off_min:02}", "light.zone=UTC")
     setting = [word for one in light for word in ("--set", one)]
@@ -73,11 +76,14 @@ def measure(folder: Path, minutes: float, kill_after_s: float) -> dict[str, Any]
         *setting,
     ]
     curve: list[tuple[float, float]] = []
+    checkpoint = folder / "cam1.liex.part" / "checkpoint.json"
     began, codes = time.monotonic(), []
     for patience_s in (kill_after_s, float("inf")):
         process = started(*command, out=subprocess.DEVNULL)
-        until = time.monotonic() + patience_s
+        until = float("inf")
         while process.poll() is None and time.monotonic() < until:
+            if until == float("inf") and checkpoint.is_file():
+                until = time.monotonic() + patience_s
             curve.append((round(time.monotonic() - began), _memory_mb(process.pid)))
             time.sleep(5.0)
         process.kill()
