@@ -308,8 +308,7 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
     Args:
         schema: the columns; those missing in the block are left out.
         block: column -> one value for all rows, an array, or a `pyarrow.DictionaryArray`.
-        copy: False if the table may share the block's arrays; one text for all rows is then stored
-            once, as an object.
+        copy: False if the table may share the block's arrays.
     """
     n = max((len(v) for v in block.values() if _is_array(v)), default=1)
     data: dict[str, Any] = {}
@@ -317,12 +316,11 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
         if column.name not in block:
             continue
         value = block[column.name]
-        text = "str" if copy or _is_array(value) else "object"
         if isinstance(value, pa.DictionaryArray):
             value = value.to_numpy(zero_copy_only=False)
         elif not _is_array(value):
-            value = np.broadcast_to(np.array(value, object), n)
-        dtype = text if column.dtype == "string" else column.dtype
+            value = [value] * n
+        dtype = "str" if column.dtype == "string" else column.dtype
         data[column.name] = pd.Series(value, dtype=dtype, copy=copy)
     return pd.DataFrame(data, copy=False)
 
