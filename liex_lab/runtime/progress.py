@@ -82,20 +82,24 @@ def logged(progress: Progress, path: Path, title: str) -> Iterator[Progress]:
     """The same progress, which within the block also appends its stages to a log.
 
     Each stage is a line with its time, and each tenth of a long one; the last line is the error
-    that ended it, or "done". A job that ends before its first stage leaves no log.
+    that ended it, or "done". A job that ends before its first stage leaves no log, nor does one
+    that is refused before there is a folder.
 
     Args:
         progress: receives the reports.
-        path: of the log, UTF-8 text; its folder is made.
+        path: of the log, UTF-8 text; its lines are held back until its folder exists.
         title: first line, such as the command.
     """
     last = ("", 0)
+    held: list[str] = []
 
     def line(text: object) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         now = datetime.now().astimezone().isoformat(timespec="seconds")
-        with path.open("a", encoding="utf-8") as file:
-            file.write(f"{now} {printable(text)}\n")
+        held.append(f"{now} {printable(text)}\n")
+        if path.parent.is_dir():
+            with path.open("a", encoding="utf-8") as file:
+                file.writelines(held)
+            held.clear()
 
     def report(done: int, total: int | None, what: str) -> None:
         nonlocal last

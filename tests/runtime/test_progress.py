@@ -28,6 +28,8 @@ def test_a_log_states_each_stage_once_and_what_ended_it(tmp_path: Path) -> None:
         with logged(lambda *one: seen.append(one), log, "liex run a") as progress:
             assert not log.exists(), "nothing was done yet"
             progress(0, None, "learning")
+            assert not log.parent.exists(), "what is refused leaves nothing"
+            log.parent.mkdir()
             for k in range(101):
                 progress(k, 100, "measuring")
             raise ValueError("broken")
