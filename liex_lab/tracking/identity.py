@@ -16,6 +16,7 @@ from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from liex_lab.runtime.kernels import kernel
 from liex_lab.tracking._association_kernels import transition_cost
@@ -24,7 +25,7 @@ from liex_lab.tracking.observations import COLUMNS, Array, Observations
 from liex_lab.tracking.rfid import Readings
 from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Crossing, Subject, Tracked, spans
-from liex_lab.tracking.trust import MOST_ERROR, contradicted
+from liex_lab.tracking.trust import MOST_ERROR, contradicted, finite_median
 
 Slots = NDArray[np.int64]
 
@@ -104,7 +105,33 @@ def identify(
         unclear = Crossing(start, stop, tuple(range(n_animals)), 0.5, "motion")
         apart = [one for one in crossings if one.stop <= start or one.start >= stop]
         crossings = tuple(sorted([*apart, unclear], key=lambda one: one.start))
-    return replace(marked, slots=slots, crossings=crossings)
+    return _by_bodies(observed, replace(marked, slots=slots, crossings=crossings))
+
+
+def _by_bodies(observed: Sequence[Observations], identity: Identity) -> Identity:
+    """The same animals, in the order of the bodies that explain them best over the recording."""
+    paths = np.where(identity.slots == NONE, NONE, 2 * identity.slots).T
+    cost = np.array(
+        [
+            [finite_median(one.along(one.residual_mm, path), np.inf) for path in paths]
+            for one in observed
+        ]
+    )
+    if not np.isfinite(cost).all():
+        return identity
+    bodies, order = linear_sum_assignment(cost)
+    if cost[bodies, order].sum() >= cost.trace():
+        return identity
+    place = np.argsort(order)
+    return replace(
+        identity,
+        slots=identity.slots[:, order],
+        crossings=tuple(
+            replace(one, animals=tuple(sorted(place[[*one.animals]].tolist())))
+            for one in identity.crossings
+        ),
+        tags=tuple(identity.tags[k] for k in order) if identity.tags else (),
+    )
 
 
 def _by_tags(

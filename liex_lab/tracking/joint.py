@@ -40,7 +40,8 @@ from liex_lab.tracking.tracker import FrameTracker
 Mask = NDArray[np.bool_]
 Labels = NDArray[np.int64]  # of pixels: the animal's number, -1 for none
 
-_SAME_SIZE = 0.25  # largest difference of the logarithms of areas of animals of one size
+_SAME_SIZE = 0.1  # largest difference of the logarithms of the sizes of animals of one size
+_CHANCE = 2.0  # that of equal animals, ordered in each frame, is 1.3 standard deviations
 _TORN = 1.25  # pixels connected in blocks over those of one animal
 _FEWEST = 5  # frames in which all stand apart
 _LEAST_SHARE = 0.3  # area of an animal over that of the largest one in view
@@ -84,13 +85,15 @@ class JointTracker:
                 "several animals are measured before a still background, and this animal is "
                 "separated by its distance; leave animal.count at 1"
             )
-        area, images = _one_by_one(scene, sample, n_animals)
+        area, size, images = _one_by_one(scene, sample, n_animals)
         if not len(images[0]):
             raise EstimationError(
                 f"animal.count is {n_animals}, but hardly a frame of a sample shows as many "
                 "animals apart; correct the number, or set animal.count to 'auto'"
             )
-        groups = np.cumsum(np.diff(-np.log(area), prepend=-np.log(area[0])) > _SAME_SIZE)
+        smaller = -np.diff(np.log(size), axis=0)
+        least = np.maximum(_SAME_SIZE, _CHANCE * smaller.std(axis=1))
+        groups = np.append(0, np.cumsum(smaller.mean(axis=1) > least))
         trackers: list[FrameTracker] = []
         heights: list[float] = []
         for group in np.unique(groups):
@@ -109,7 +112,7 @@ class JointTracker:
             heights.append(usual.volume_mm3 / usual.area_mm2)
             trackers += [replace(tracker, n_measured=n_animals)] * len(ranks)
         # the smallest animal and all of them together are equally far from this area
-        middle = float(np.sqrt(area[-1] * area.sum()))
+        middle = float(np.sqrt(area.min() * area.sum()))
         return JointTracker(replace(scene, area_mm2=middle), tuple(trackers), heights[0])
 
     @property
@@ -124,8 +127,7 @@ class JointTracker:
 
     @cached_property
     def _least_mm2(self) -> float:
-        smallest = self.trackers[-1].scene
-        return _LEAST_AREA * smallest.area_mm2
+        return _LEAST_AREA * min(tracker.scene.area_mm2 for tracker in self.trackers)
 
     def observe(self, frames: Sequence[DepthFrame]) -> list[Observations]:
         """The pose hypotheses of consecutive frames, with the body of each animal.
@@ -377,9 +379,12 @@ class JointTracker:
 
 def _one_by_one(
     scene: BackgroundSubtraction, sample: NDArray[np.float32], n_animals: int
-) -> tuple[Array, list[NDArray[np.float32]]]:
-    """Usual areas (N,) mm^2 of the animals of a sample, the largest first, and for each of these
-    ranks the images (k, H, W) mm in which they stand apart, without the others.
+) -> tuple[Array, Array, list[NDArray[np.float32]]]:
+    """The animals of a sample in the k frames in which all stand apart, the largest first in each:
+    usual areas (N,) mm^2, sizes (N, k), and images (k, H, W) mm of each without the others.
+
+    Size is the volume of an animal on the floor, which posture changes less than its area, and the
+    area of a swimming one.
     """
     crops = scene.extract(sample, 1.0, n_candidates=n_animals)
     n = len(sample)
@@ -393,9 +398,10 @@ def _one_by_one(
     animals &= blobs.area_mm2 > _LEAST_SHARE * np.tile(blobs.area_mm2[rows].max(axis=0), n_animals)
     apart = np.flatnonzero(animals[rows].all(axis=0))
     if len(apart) < _FEWEST:
-        return np.ones(n_animals), [sample[:0]] * n_animals
-    area = blobs.area_mm2[rows[:, apart]]
-    order = np.argsort(-area, axis=0, kind="stable")
+        return np.ones(n_animals), np.ones((n_animals, 1)), [sample[:0]] * n_animals
+    on_floor = scene.view.frame == VIEWS[0]
+    size = (blobs.volume_mm3 if on_floor else blobs.area_mm2)[rows[:, apart]]
+    order = np.argsort(-size, axis=0, kind="stable")
     square = np.ones((7, 7), np.uint8)
     masks = np.array(
         [scene.animal_masks(crops[rows[k, apart]]) for k in range(n_animals)], np.uint8
@@ -408,7 +414,11 @@ def _one_by_one(
             others &= masks[k, i] == 0
             left[i] = np.where(others, scene.background, left[i])
         images.append(left)
-    return np.median(-np.sort(-area, axis=0), axis=1), images
+    area, size = (
+        np.take_along_axis(values, order, axis=0)
+        for values in (blobs.area_mm2[rows[:, apart]], size)
+    )
+    return np.median(area, axis=1), size, images
 
 
 @kernel(nogil=True)
