@@ -217,14 +217,14 @@ def _covering(observed: Observations, touching: NDArray[np.bool_]) -> NDArray[np
 
 def flag_unclear(tracked: Tracked) -> None:
     """Flag the poses of a track in place: unclear where it is not clear whose they are, doubtful in
-    a crossing that begins before the animal stood apart, as its head is unknown there.
+    a crossing where the head is not clear, as it is in all that begin before the animal stood apart.
     """
     first = int(np.argmax(tracked.track.posed))
     for one in tracked.crossings or ():
         flag = tracked.track.flag[one.start : one.stop]
-        if one.start <= first:
-            flag[flag == ""] = "doubtful"
-        elif one.p_swap > UNCLEAR:
+        turned = tracked.track.p_flip[one.start : one.stop] > UNCLEAR
+        flag[(flag == "") & (turned | (one.start <= first))] = "doubtful"
+        if one.p_swap > UNCLEAR:
             flag[flag == ""] = "unclear"
 
 
