@@ -38,7 +38,7 @@ from liex_lab.tracking.residual import render_crops
 from liex_lab.tracking.tracker import FrameTracker
 
 Mask = NDArray[np.bool_]
-Labels = NDArray[np.int64]  # of pixels: the animal's number, -1 for none
+Labels = NDArray[np.int8]  # of pixels: the animal's number, -1 for none
 
 _SAME_SIZE = 0.1  # largest difference of the logarithms of the sizes of animals of one size
 _CHANCE = 2.0  # that of equal animals, ordered in each frame, is 1.3 standard deviations
@@ -238,19 +238,21 @@ class JointTracker:
         """
         q = len(blobs.n_px)
         labels, bodies = self._cuts(blobs, m)
-        cost, drawn = self._tried(blobs, labels, bodies)
+        observed = self._observed(blobs)
+        cost, drawn = self._tried(blobs, observed, labels, bodies)
         rows, best = np.arange(q), cost.argmin(axis=1)
         kept_cost, kept, shown = cost[rows, best], labels[rows, best], drawn[rows, best]
         now = kept
         for _ in range(_SWEEPS):
-            now = self._owners(blobs, shown, now)
-            again, fresh = self._tried(blobs, now[:, None], bodies[rows, best][:, None])
+            now = self._owners(observed, shown, now)
+            again, fresh = self._tried(blobs, observed, now[:, None], bodies[rows, best][:, None])
             better = again[:, 0] < kept_cost
             kept_cost = np.where(better, again[:, 0], kept_cost)
             kept = np.where(better[:, None, None], now, kept)
             shown = fresh[:, 0]
         alone, _ = self._tried(
             blobs,
+            observed,
             np.where(blobs.heights > 0, 0, -1)[:, None].repeat(len(self._bodies), axis=1),
             np.tile(np.arange(len(self._bodies))[:, None], (q, 1, 1)),
         )
@@ -268,20 +270,21 @@ class JointTracker:
         angles = np.arange(n_ways) * np.pi / _N_DIRECTIONS
         share = np.cumsum(areas[chosen]) / areas[chosen].sum()
         v, u = np.mgrid[: blobs.heights.shape[1], : blobs.heights.shape[2]]
-        labels = np.full((len(blobs.n_px), n_ways, *u.shape), -1, np.int64)
-        for i, heights in enumerate(blobs.heights):
+        labels = np.full((len(blobs.n_px), n_ways, *u.shape), -1, np.int8)
+        for own, heights in zip(labels, blobs.heights, strict=True):
             inside = heights > 0
-            axes = np.linalg.eigh(np.cov(u[inside], v[inside]))[1]  # across and along
-            for p, angle in enumerate(angles):
-                along = axes @ (np.cos(angle), np.sin(angle)) @ (u[inside], v[inside])
-                labels[i, p, inside] = np.searchsorted(np.quantile(along, share[:-1]), along)
+            pixels = np.array([u[inside], v[inside]])
+            axes = np.linalg.eigh(np.cov(pixels))[1]  # across and along
+            along = (axes @ (np.cos(angles), np.sin(angles))).T @ pixels
+            cuts = np.quantile(along, share[:-1], axis=1)
+            own[:, inside] = (along > cuts[..., None]).sum(axis=0)
         return labels, np.tile(bodies[chosen], (len(labels), n_ways, 1))
 
     def _cut(self, blobs: HeightMaps, labels: Labels, m: int) -> HeightMaps:
         """The height maps of the parts of components (q rows): m q rows, part by part."""
         parts = HeightMaps.join([blobs] * m)
         mine = np.concatenate([labels == j for j in range(m)])
-        parts.heights[:] = np.where(mine, parts.heights, 0)
+        parts.heights[~mine] = 0
         behind_mm = self.scene.view.behind_mm if self._camera_view else 0.0
         if self._camera_view:  # heights are measured from behind the middle of each part
             n_px = np.maximum(mine.sum(axis=(1, 2)), 1)
@@ -302,10 +305,15 @@ class JointTracker:
         return parts
 
     def _tried(
-        self, blobs: HeightMaps, labels: Labels, bodies: NDArray[np.int64]
+        self,
+        blobs: HeightMaps,
+        observed: NDArray[np.float32],
+        labels: Labels,
+        bodies: NDArray[np.int64],
     ) -> tuple[Array, NDArray[np.float32]]:
-        """Cost (q, P) of explaining components (q rows) by the parts `labels` (q, P, S, S), each
-        with its body (q, P, m); and the rendered bodies (q, P, m, S, S) mm.
+        """Cost (q, P) of explaining components (q rows), whose depth is `observed`, by the parts
+        `labels` (q, P, S, S), each with its body (q, P, m); and the rendered bodies (q, P, m, S, S)
+        mm.
         """
         q, p, size = labels.shape[:3]
         m = bodies.shape[2]
@@ -317,7 +325,7 @@ class JointTracker:
             rows = np.flatnonzero((which == k) & parts.found)
             drawn[rows] = self._rendered(body, parts[rows])
         together = drawn.reshape(m, q, p, size, size).transpose(1, 2, 0, 3, 4)
-        cost = self._cost(blobs, together)
+        cost = self._cost(observed[:, None], together)
         missing = ~parts.found.reshape(m, q, p).all(axis=0)
         return np.where(missing, np.inf, cost), together
 
@@ -348,10 +356,9 @@ class JointTracker:
         up = 1.0 - blobs.heights / 16.0 / blobs.distance[:, None, None]
         return np.where(blobs.heights > 0, up / (a * u + b * v + c), 0.0).astype(np.float32)
 
-    def _cost(self, blobs: HeightMaps, drawn: NDArray[np.float32]) -> Array:
-        """Cost (q, P) mm of rendered bodies (q, P, m, S, S), see the module."""
+    def _cost(self, observed: NDArray[np.float32], drawn: NDArray[np.float32]) -> Array:
+        """Cost (q, P) mm of rendered bodies (q, P, m, S, S) in depth (q, 1, S, S) mm."""
         most = np.float32(_MOST_OFF * np.sqrt(self.trackers[-1].scene.area_mm2))
-        observed = self._observed(blobs)[:, None]
         nearest = np.where(drawn > 0, drawn, np.inf).min(axis=2)
         inside = observed > 0
         off = np.where(inside, np.minimum(np.abs(nearest - observed), most), 0.0)
@@ -359,9 +366,11 @@ class JointTracker:
         n_px = np.maximum(inside.sum(axis=(2, 3)), 1)
         return np.asarray((off + beside).sum(axis=(2, 3)) / n_px)
 
-    def _owners(self, blobs: HeightMaps, drawn: NDArray[np.float32], labels: Labels) -> Labels:
-        """Labels (q, S, S) of the pixels by the rendered bodies (q, m, S, S) nearest to them."""
-        observed = self._observed(blobs)
+    @staticmethod
+    def _owners(
+        observed: NDArray[np.float32], drawn: NDArray[np.float32], labels: Labels
+    ) -> Labels:
+        """Labels (q, S, S) of pixels of depth `observed` by the nearest of bodies (q, m, S, S)."""
         out = labels.copy()
         for i, bodies in enumerate(drawn):
             if not all(body.any() for body in bodies):
