@@ -34,8 +34,9 @@ SEVERAL_PROTOCOL = (
     "Rendered mice that interact, each recording measured as `liex run` does and its tables read "
     "back. idf1, hota: as TrackEval computes them, similarity 1 - d / 30 mm of the mean joint "
     "distance d, so that 15 mm is a match for idf1; every animal counts in every frame. swaps: "
-    "moments at which a measured individual goes over from one true animal to another (nearest "
-    "within 15 mm, by assignment in each frame; changes within 0.5 s are one). "
+    "moments at which a measured individual goes over from one true animal to another (within "
+    "15 mm, by assignment in each frame, in which it keeps its animal while that is within 15 mm, "
+    "as in CLEAR MOT, Bernardin and Stiefelhagen 2008; changes within 0.5 s are one). "
     "swaps_per_contact_hour: swaps over the hours in which the skins of a pair are within 10 mm, "
     "summed over pairs. joint_error_apart_mm, joint_error_contact_mm: mean over joints and frames "
     "of the distance to the nearest true animal by assignment, capped at 65 mm, where that animal "
@@ -86,7 +87,9 @@ def track_counts(distance_mm: Array, time_s: Array) -> Counts:
     for moment, now in zip(time_s, similarity, strict=True):
         rows, columns = linear_sum_assignment(-alignment * now)
         matches[:, rows, columns] += now[rows, columns] >= _ALPHAS[:, None] - 1e-9
-        rows, columns = linear_sum_assignment(-np.where(now >= _HALF, now, 0.0))
+        stays = np.zeros(now.shape)
+        stays[[*holds.values()], [*holds]] = len(now)
+        rows, columns = linear_sum_assignment(-np.where(now >= _HALF, now + stays, 0.0))
         on = {k: t for t, k in zip(rows.tolist(), columns.tolist(), strict=True) if now[t, k] > 0.5}
         if any(holds.get(k, t) != t for k, t in on.items()):
             found["swaps"] += int(moment - last_s > _SWAP_S)

@@ -168,7 +168,7 @@ class BackgroundSubtraction(Segmenter):
         return np.diag([1.0, -1.0, -1.0]) if camera_view else self.floor.T_arena_camera.rotation
 
     def planes(self, crops: HeightMaps, camera_view: bool = False) -> Array:
-        """The reference plane of each height map: the floor, or one behind the animal.
+        """The reference plane of each height map: the floor, one above it or behind the animal.
 
         Args:
             crops: n height maps.
@@ -178,7 +178,8 @@ class BackgroundSubtraction(Segmenter):
             (n, 3) a, b, c of 1 / z = a u + b v + c, per mm, u and v in image pixels.
         """
         if not camera_view:
-            return np.tile(self.floor.inverse_depth, (len(crops.step), 1))
+            higher = self.floor.distance_mm / crops.distance  # 1 on the floor
+            return higher[:, None] * self.floor.inverse_depth
         level = np.zeros((len(crops.step), 3))
         level[:, 2] = 1.0 / crops.distance
         return level
@@ -191,7 +192,9 @@ class BackgroundSubtraction(Segmenter):
             camera_view: as they were extracted.
         """
         middle = crops.centroid
-        if camera_view:  # the view's frame is not the arena's
+        if not camera_view:
+            middle[:, 2] += self.floor.distance_mm - crops.distance
+        else:  # the view's frame is not the arena's
             middle[:, 2] -= crops.distance
             middle = self.floor.T_arena_camera @ (middle @ self.view_rotation(camera_view))
         return middle

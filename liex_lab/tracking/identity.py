@@ -36,6 +36,8 @@ _GAP_S = 0.1  # time without all animals in view over which they are continued
 _VELOCITY_S = 0.2  # time over which their velocity is measured
 _STRETCH_SD = 0.04  # that of its mean over a stretch, of 0.015 of virtual mice
 _PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
+_MOST_NATS = 9.0  # of one frame
+_NOISE_MM = 0.3  # distance of a body from the depth below which there is no better one
 _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
 _OFF = 2.0  # nats, of a reading whose tag is two half lengths beyond the antenna's range
@@ -92,7 +94,8 @@ def identify(
         path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
         _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
         path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
-        sizes = emission = _sizes(observed[0][full], states[path], states)
+        bodies = np.stack([_misfit(one)[full] for one in observed])
+        sizes = emission = _sizes(observed[0][full], bodies, states[path], states)
         path, _ = _viterbi(transition, emission)
         if readings is not None:
             places = observed[0].centroid_mm[full, ::2, :2].astype(float)
@@ -101,7 +104,7 @@ def identify(
         slots[full] = states[path]
         by = {"motion": np.zeros_like(sizes), "size": sizes, "rfid": emission}
         crossings = _crossings(observed[0], full, transition, by, path, states)
-    for start, stop in _follow(observed[0], subjects[0].length_mm, slots, known):
+    for start, stop in _follow(observed, subjects[0].length_mm, slots, known):
         unclear = Crossing(start, stop, tuple(range(n_animals)), 0.5, "motion")
         apart = [one for one in crossings if one.stop <= start or one.start >= stop]
         crossings = tuple(sorted([*apart, unclear], key=lambda one: one.start))
@@ -216,16 +219,16 @@ def _covering(observed: Observations, touching: NDArray[np.bool_]) -> NDArray[np
 
 
 def flag_unclear(tracked: Tracked) -> None:
-    """Flag the poses of a track in place: unclear where it is not clear whose they are, doubtful in
-    a crossing where the head is not clear, as it is in all that begin before the animal stood apart.
+    """Flag the poses of a track in place: in crossings unclear where it is not clear whose they are
+    or which end is the head; doubtful in those that begin before the animal stood apart.
     """
     first = int(np.argmax(tracked.track.posed))
     for one in tracked.crossings or ():
         flag = tracked.track.flag[one.start : one.stop]
+        if one.start <= first:
+            flag[flag == ""] = "doubtful"
         turned = tracked.track.p_flip[one.start : one.stop] > UNCLEAR
-        flag[(flag == "") & (turned | (one.start <= first))] = "doubtful"
-        if one.p_swap > UNCLEAR:
-            flag[flag == ""] = "unclear"
+        flag[(flag == "") & (turned | (one.p_swap > UNCLEAR))] = "unclear"
 
 
 def doubt(crossings: Sequence[Crossing]) -> str:
@@ -316,18 +319,26 @@ def _velocity(own: Array, seconds: Array, t: int, side: int) -> Array:
     return np.asarray(np.tensordot(since, own[rows], 1) / max(float(since @ since), 1e-9))
 
 
-def _sizes(observed: Observations, path: Slots, states: Slots) -> Array:
-    """Cost (m, S) of each assignment by the sizes of the outlines, nats.
+def _misfit(observed: Observations) -> Array:
+    """The logarithm (n, N) of the distance of an animal's body from the depth of components, mm."""
+    return np.log(np.maximum(np.nan_to_num(observed.residual_mm[:, ::2], nan=1.0), _NOISE_MM))
 
-    The sizes of the animals, the largest first, are the means of the ordered sizes in the stretches
-    in which all stand apart. One stretch errs alike throughout, by postures and places, so that its
-    evidence has a limit, and of sizes that differ little the order is chance:
+
+def _sizes(observed: Observations, bodies: Array, path: Slots, states: Slots) -> Array:
+    """Cost (m, S) of each assignment by the animals' bodies, or by their sizes, nats.
+
+    Where the animals have bodies of their own, it is the sum of the logarithms of the distances of
+    these from the depth, as of exponentially distributed ones. Otherwise, the sizes of the animals,
+    the largest first, are the means of the ordered sizes of outlines in the stretches in which all
+    stand apart. One stretch errs alike throughout, by postures and places, so that its evidence has
+    a limit, and of sizes that differ little the order is chance:
 
         cost = sum_k (x_k - u_k)^2 / (2 s^2) / (1 + n t^2 / s^2),
         u = shrunk by sqrt(1 - t^2 / (2 var u)), n: independent outlines of the stretch.
 
     Args:
         observed: the m frames that show all animals.
+        bodies: (N, m, N) misfit of each animal's body and each component, see `_misfit`.
         path: (m, N) an assignment of their components.
         states: (S, N) the assignments.
     """
@@ -346,10 +357,14 @@ def _sizes(observed: Observations, path: Slots, states: Slots) -> Array:
         weight[rows] /= 1.0 + n * shared
         usual += n / (1.0 + n * shared) * np.sort(own[rows].mean(axis=0))[::-1]
         total += n / (1.0 + n * shared)
+    if (bodies != bodies[0]).any():
+        off = bodies[np.arange(n_animals), :, states].sum(axis=1).T
+        off = off - off.min(axis=1, keepdims=True)
+        return np.asarray((weight * apart)[:, None] * np.minimum(off, _MOST_NATS))
     usual /= total
     usual *= np.sqrt(max(0.0, 1.0 - 0.5 * _STRETCH_SD**2 / max(float(usual.var()), 1e-9)))
     off = ((size[:, states] - usual) / _SIZE_SD) ** 2
-    return np.asarray(0.5 * (weight * apart)[:, None] * np.minimum(off.sum(axis=-1), 18.0))
+    return np.asarray((weight * apart)[:, None] * np.minimum(0.5 * off.sum(axis=-1), _MOST_NATS))
 
 
 def _viterbi(transition: Array, emission: Array) -> tuple[Slots, float]:
@@ -429,17 +444,19 @@ def _backward(transition: Array, emission: Array) -> Array:
 
 
 def _follow(
-    observed: Observations, length_mm: float, slots: Slots, known: NDArray[np.bool_]
+    every: Sequence[Observations], length_mm: float, slots: Slots, known: NDArray[np.bool_]
 ) -> Iterator[tuple[int, int]]:
     """Assign the components of frames that do not show all animals, in place, frame by frame from
     the nearest frame that does.
 
-    A component belongs to the animal of the least cost (d / s)^2 + 2 log s, d: its distance from
-    where that was last in view, s: a standard deviation that grows with the time since.
+    A component belongs to the animal of the least cost (d / s)^2 + 2 log s + 4 log r, d: its
+    distance from where that was last in view, s: a standard deviation that grows with the time
+    since, r: the distance of that animal's body from the depth.
 
     Yields:
         The spans whose two ends do not agree.
     """
+    observed, misfit = every[0], np.stack([_misfit(one) for one in every], axis=1)
     seconds, places = observed.seconds, observed.centroid_mm[:, ::2, :2].astype(float)
     full = np.flatnonzero((slots != NONE).all(axis=1))
     usual_px = np.median(observed.n_px[full, ::2]) if len(full) else 0.0
@@ -452,7 +469,7 @@ def _follow(
                 there = np.flatnonzero(known[t])
                 sd = length_mm * (_PLACE_SHARE + np.abs(seconds[t] - last_s))[:, None]
                 off = np.linalg.norm(last[:, None] - places[t, there], axis=-1)
-                cost = (off / sd) ** 2 + 2.0 * np.log(sd)
+                cost = (off / sd) ** 2 + 2.0 * np.log(sd) + 4.0 * misfit[t][:, there]
                 for _ in there:
                     animal, one = np.unravel_index(np.argmin(cost), cost.shape)
                     way[t - start, animal] = there[one]

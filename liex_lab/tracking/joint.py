@@ -11,7 +11,8 @@ such an explanation is
 The best explanation is then improved alternately: every pixel goes to the body whose surface is
 nearest to it in depth, or in the image where none is rendered, and each body is measured again on
 its own pixels (hard expectation maximisation). A component that one body explains as well is one
-animal. Only components of several animals pay for all this.
+animal, and one that a body high above the floor explains better than two is an animal on top of
+another one, of which little is seen. Only components of several animals pay for all this.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ _N_DIRECTIONS = 4  # of the cuts, in half a turn
 _SWEEPS = 2
 _MOST_OFF = 0.2  # of a pixel, in roots of the animal's area
 _BETTER = 0.85  # cost of several bodies over that of one
+_ON_TOP = 0.6  # how much higher than usual an animal on another one is, in its usual heights
 
 
 @dataclass(frozen=True)
@@ -59,12 +61,12 @@ class JointTracker:
     Attributes:
         scene: the segmenter of the recording's camera.
         trackers: one for each animal, the largest first; animals of one size share one.
-        height_mm: usual mean height of an animal from the floor.
+        heights_mm: the usual mean height of each from the floor.
     """
 
     scene: BackgroundSubtraction
     trackers: tuple[FrameTracker, ...]
-    height_mm: float
+    heights_mm: tuple[float, ...]
 
     @staticmethod
     def prepare(alone: FrameTracker, sample: NDArray[np.float32], n_animals: int) -> JointTracker:
@@ -109,11 +111,11 @@ class JointTracker:
                 bridge_s=alone.bridge_s,
                 adapt=alone.shape is not None,
             )
-            heights.append(usual.volume_mm3 / usual.area_mm2)
+            heights += [usual.volume_mm3 / usual.area_mm2] * len(ranks)
             trackers += [replace(tracker, n_measured=n_animals)] * len(ranks)
         # the smallest animal and all of them together are equally far from this area
         middle = float(np.sqrt(area.min() * area.sum()))
-        return JointTracker(replace(scene, area_mm2=middle), tuple(trackers), heights[0])
+        return JointTracker(replace(scene, area_mm2=middle), tuple(trackers), tuple(heights))
 
     @property
     def estimator(self) -> PoseEstimator:
@@ -219,7 +221,7 @@ class JointTracker:
         area = np.where(crops.found, crops.blobs.area_mm2, 0.0)
         right = area >= self._least_mm2
         if self.scene.view.frame == VIEWS[0]:  # swimming animals are at any height
-            height = crops.blobs.volume_mm3 / np.maximum(area, 1e-9) / self.height_mm
+            height = crops.blobs.volume_mm3 / np.maximum(area, 1e-9) / self.heights_mm[0]
             right &= (height > ANIMAL_HEIGHTS[0]) & (height < ANIMAL_HEIGHTS[1])
         return np.asarray(right)
 
@@ -256,9 +258,51 @@ class JointTracker:
             np.where(blobs.heights > 0, 0, -1)[:, None].repeat(len(self._bodies), axis=1),
             np.tile(np.arange(len(self._bodies))[:, None], (q, 1, 1)),
         )
-        split = self._cut(blobs, kept, m)
-        enough = (split.blobs.area_mm2.reshape(m, q) > 0.6 * self._least_mm2).all(axis=0)
-        return split, enough & (kept_cost < _BETTER * alone.min(axis=1))
+        several = kept_cost < _BETTER * alone.min(axis=1)
+        up_mm = np.zeros((m, q))
+        on_top = np.zeros(q, np.bool_)
+        if m == 2 and not self._camera_view:
+            upper, up_mm[0], cost = self._on_top(blobs, observed)
+            on_top = _BETTER * cost < kept_cost
+            up_mm[0, ~on_top] = 0.0
+            kept = np.where(on_top[:, None, None], upper, kept)
+        split = self._cut(blobs, kept, m, up_mm.ravel())
+        enough = split.blobs.area_mm2.reshape(m, q) > 0.6 * self._least_mm2
+        split.n_px[~enough.ravel()] = 0
+        return split, on_top | (several & enough.all(axis=0))
+
+    def _on_top(
+        self, blobs: HeightMaps, observed: NDArray[np.float32]
+    ) -> tuple[Labels, Array, Array]:
+        """Explain components (q rows) by one animal on top of another one.
+
+        The upper animal has the highest pixels, as many as usual, and is measured from so far above
+        the floor that its mean height is the usual one.
+
+        Returns:
+            Labels (q, S, S), 0 on the upper animal and 1 elsewhere; how far (q,) it is raised, mm;
+            and the cost (q,) of its body alone, infinite if it is not raised enough.
+        """
+        q = len(blobs.n_px)
+        out = np.full(blobs.heights.shape, -1, np.int8)
+        up_mm, least = np.zeros(q), np.full(q, np.inf)
+        for body in self._bodies:
+            usual_mm = self.heights_mm[self.trackers.index(body)]
+            share = np.clip(1.0 - body.scene.area_mm2 / blobs.blobs.area_mm2, 0.0, 1.0)
+            labels, raised_mm = out.copy(), np.zeros(q)
+            for i, heights in enumerate(blobs.heights):
+                inside = heights[heights > 0]
+                upper = inside >= np.quantile(inside, share[i])
+                labels[i, heights > 0] = np.where(upper, 0, 1)
+                raised_mm[i] = inside[upper].mean() / 16.0 - usual_mm
+            high = np.flatnonzero(raised_mm > _ON_TOP * usual_mm)
+            part = self._cut(blobs[high], labels[high], 1, raised_mm[high])
+            drawn = self._rendered(body, part)
+            cost = self._cost(observed[high, None], drawn[:, None, None])[:, 0]
+            better = high[cost < least[high]]
+            least[high] = np.minimum(cost, least[high])
+            out[better], up_mm[better] = labels[better], raised_mm[better]
+        return out, up_mm, least
 
     def _cuts(self, blobs: HeightMaps, m: int) -> tuple[Labels, NDArray[np.int64]]:
         """Labels (q, P, S, S) of the parts in P ways of cutting, and the body (q, P, m) of each."""
@@ -280,15 +324,21 @@ class JointTracker:
             own[:, inside] = (along > cuts[..., None]).sum(axis=0)
         return labels, np.tile(bodies[chosen], (len(labels), n_ways, 1))
 
-    def _cut(self, blobs: HeightMaps, labels: Labels, m: int) -> HeightMaps:
-        """The height maps of the parts of components (q rows): m q rows, part by part."""
+    def _cut(
+        self, blobs: HeightMaps, labels: Labels, m: int, up_mm: Array | float = 0.0
+    ) -> HeightMaps:
+        """The height maps of the parts of components (q rows): m q rows, part by part, each
+        measured from up_mm (m q,) above the floor.
+        """
         parts = HeightMaps.join([blobs] * m)
         mine = np.concatenate([labels == j for j in range(m)])
         parts.heights[~mine] = 0
         behind_mm = self.scene.view.behind_mm if self._camera_view else 0.0
+        lift = np.zeros(len(mine)) - up_mm
         if self._camera_view:  # heights are measured from behind the middle of each part
             n_px = np.maximum(mine.sum(axis=(1, 2)), 1)
-            lift = behind_mm - parts.heights.sum(axis=(1, 2)) / 16.0 / n_px
+            lift += behind_mm - parts.heights.sum(axis=(1, 2)) / 16.0 / n_px
+        if lift.any():
             raised = parts.heights + (16.0 * lift)[:, None, None]
             parts.heights[:] = np.where(mine, np.maximum(raised, 1), 0)
             parts.distance[:] += lift

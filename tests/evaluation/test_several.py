@@ -63,6 +63,9 @@ def test_a_track_that_goes_over_to_another_animal_is_a_swap():
     both = apart.copy()
     both[40:] = both[40:, ::-1]
     assert several.track_counts(both, time_s)["swaps"] == 1
+    near = apart.copy()  # the other animal is nearer for a while, and its own is within 15 mm
+    near[40:60] = [[12.0, 6.0], [6.0, 12.0]]
+    assert several.track_counts(near, time_s)["swaps"] == 0
     one = apart[:, :, :1].copy()  # a single animal is measured
     one[40:60] = one[40:60, ::-1]
     assert several.track_counts(one, time_s)["swaps"] == 2

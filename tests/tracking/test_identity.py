@@ -73,6 +73,22 @@ def test_a_frame_that_shows_one_of_two_belongs_to_the_one_that_is_near() -> None
     assert order[40, 0] == order[39, slots[39, near]]
 
 
+def test_the_body_that_fits_decides_whose_component_it_is() -> None:
+    order = shuffled(2)
+    every = [mixed(2, order) for _ in range(2)]
+    for k, seen in enumerate(every):  # the first body is that of the second animal
+        seen.residual_mm[:] = np.repeat(np.where(order == 1 - k, 1.0, 3.0), 2, axis=1)
+        lose(seen, LOST)
+        for name in (*POSE[:-2], "residual_mm"):
+            getattr(seen, name)[60, 2:] = np.nan
+        seen.centroid_mm[60, :2] = seen.centroid_mm[[59, 61]].mean(axis=(0, 1))  # between both
+    slots = identify(every, [SUBJECT] * 2).slots
+    both = (slots >= 0).all(axis=1)
+    assert (named(order, slots)[both] == [1, 0]).all()
+    assert both.sum() == len(SECONDS) - 16
+    assert slots[60].tolist() == [0 if order[60, 0] == 1 - k else -1 for k in range(2)]
+
+
 @pytest.mark.parametrize("away", [slice(0, 50), slice(30, 60), slice(45, None)])
 def test_an_animal_that_enters_leaves_or_hides_does_not_take_the_name_of_the_other(
     away: slice,
@@ -153,8 +169,12 @@ def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
     tracked = replace(
         track_whole(SUBJECT, told(SECONDS, WALKS[0])), crossings=(from_the_start, unclear, clear)
     )
+    tracked.track.p_flip[35:50] = 0.2  # the head is not clear: it counts in contact alone
     flag_unclear(tracked)
     assert np.flatnonzero(tracked.track.flag == "doubtful").tolist() == [*range(4)]
-    assert np.flatnonzero(tracked.track.flag == "unclear").tolist() == [*range(10, 20)]
+    assert np.flatnonzero(tracked.track.flag == "unclear").tolist() == [
+        *range(10, 20),
+        *range(35, 40),
+    ]
     assert doubt([Crossing(0, 1, (0, 1), 1.0 - CERTAIN - 1e-9, "motion")]) == ""
     assert "70% certain" in doubt([unclear])
