@@ -313,7 +313,8 @@ def _apply(
         written = {
             name: table for name, table in written.items() if name not in ("kinematics", "zones")
         }
-    described = {"interactions": schema.INTERACTIONS, "triggers": schema.TRIGGERS}
+    described = {"interactions": schema.INTERACTIONS}
+    described |= {"triggers": schema.TRIGGERS, "moseq": schema.MOSEQ}
     more = [each for name, each in described.items() if raw.has(f"{name}.parquet")]
     results.write_measured(folder, written, (*behaviour.columns, *chain(*more)))
     facts |= {"corrections": _summary(log), "actions": dict(behaviour.actions)}

@@ -64,7 +64,7 @@ from liex_lab.sessions.writer import (
     shard_writer,
 )
 from liex_lab.tables.rows import Rows, bout_rows
-from liex_lab.tables.schema import BOUTS, empty_table
+from liex_lab.tables.schema import BOUTS, MOSEQ, empty_table, to_pandas
 from liex_lab.tracking import curve, identity, observations, trust
 from liex_lab.tracking.track import Crossing
 from liex_lab.tracking.tracker import FrameTracker
@@ -674,6 +674,11 @@ def conclude(
     writer.note(**notes, problems=_refused_sentence(notes))
     memory.release_memory()
     closing = behaviour.for_session()
+    if stated := writer.origin.measured:
+        known: dict[str, Any] = {one.name: stated.get(one.name, np.nan) for one in MOSEQ}
+        known |= dict(writer.rows.frames_table[["session_id", "individual", "frame_index"]])
+        closing["results"]["moseq"] = to_pandas(MOSEQ, known)
+        closing["columns"] += MOSEQ
     if further is not None:
         more = further.for_session(writer.rows, behaviour.tables)
         closing["results"] |= more["results"]

@@ -1,12 +1,13 @@
 """MoSeq's scalars of a session, by its definitions and in true millimetres; MoSeq's syllables.
 
-Scalars are those of moseq2-extract.
+Scalars are those of moseq2-extract; of a session of its results, those that the file held.
 
-The height over the background, within 10 to 100 mm, is smoothed (median of 3 pixels, opening by 9),
-and the largest outline gives centroid (x, y), direction of the long axis, and with the eigenvalues
-l of its second moments the lengths 2 sqrt(2) sqrt(2 l), px. Area and mean height are those of the
-pixels within 40 px. MoSeq takes the angle of view where its tangent belongs, and the floor's
-distance D for every height:
+The height over the background in whole mm, within 10 to 100, is smoothed (median of 3 pixels,
+opening by 9), and the largest outline gives centroid (x, y), direction of the long axis, and with
+the eigenvalues l of its second moments the lengths 2 sqrt(2) sqrt(2 l), px. Area and mean height
+are those of the pixels in a square of 80 px about it, turned until the animal lies level (which
+costs about 3 % of the area). MoSeq takes the angle of view where its tangent belongs, and the
+floor's distance D for every height:
 
     x_mm = D (x - 256) / 415.5,    y_mm = D (y - 212) / 404.9    (px from the corner of its crop),
 
@@ -26,6 +27,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.errors import LiexError, how_to_install, one_line
+from liex_lab.recordings.formats.moseq_results import SHAPE
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.cutouts import open_depth, still_scene
@@ -51,27 +53,27 @@ def scalars_moseq(session: Session) -> pd.DataFrame:
     """MoSeq's eighteen scalars, one row per frame, NaN in frames without an animal.
 
     Their names are MoSeq's; names with `true_mm` are metric, those that end in `_s` per second
-    (MoSeq's velocities are per frame, whatever time lies between). Head and tail, which the angle
-    needs, are those of the session.
+    (MoSeq's velocities are per frame, whatever time lies between). Of a session of MoSeq's results,
+    its own columns are as the file held them, and metric ones are computed from those. Otherwise
+    head and tail, which the angle needs, are those of the session.
 
     Raises:
         SessionError: the session keeps no depth images.
     """
     poses, frames, camera = session.pose_arrays(), session.frames, session.camera
-    with open_depth(session) as depth:
-        scene = still_scene(depth).astype(float)
-        px = np.array([_shape(scene - frame.depth, frame.depth > 0) for frame in depth])
-    centroid, axis, length, width, area, height = (
-        px[:, :2],
-        px[:, 2],
-        px[:, 3],
-        px[:, 4],
-        px[:, 5],
-        px[:, 6],
-    )
     stated = session.metadata["input"].get("profile", {})
-    floor_mm = stated.get("moseq_floor_mm", float(session.T_arena_camera.translation[2]))
     corner = np.array(stated.get("moseq_corner_px", (0, 0)))
+    kept = pd.DataFrame()
+    if session.has("moseq.parquet"):
+        kept = session.table("moseq").iloc[:, 3:].dropna(axis=1, how="all")
+        px = kept[[*SHAPE]].to_numpy() + np.pad(corner, (0, 5))
+    else:
+        with open_depth(session) as depth:
+            scene = still_scene(depth).astype(float)
+            px = np.array([_shape(scene - frame.depth, frame.depth > 0) for frame in depth])
+    centroid = px[:, :2]
+    axis, length, width, area, height = px[:, 2:].T
+    floor_mm = stated.get("moseq_floor_mm", float(session.T_arena_camera.translation[2]))
     ahead = (poses.uv_px[:, -1] - poses.uv_px[:, 0]) * (1, -1)
     behind = np.sum(ahead * np.stack([np.cos(axis), np.sin(axis)], axis=1), axis=1) < 0
     places = {
@@ -94,21 +96,22 @@ def scalars_moseq(session: Session) -> pd.DataFrame:
             speed = np.linalg.norm(step[:, :n], axis=1)
             table |= {f"velocity_{n}d_{unit}": speed, f"velocity_{n}d_{unit}_s": speed / dt_s}
         table |= {f"length_{unit}": length * along, f"width_{unit}": width * across}
+    yx = places["mm"][:, 1::-1]
     table |= {
         "area_px": area,
         "area_mm": area * scales["mm"].mean(),
         "area_true_mm2": area * scales["true_mm"].prod(axis=1),
         "height_ave_mm": height,
         "angle": _unwrapped(axis + np.pi * behind),
-        "velocity_theta": np.arctan2(*np.diff(places["mm"][:, :2], axis=0, prepend=np.nan).T[::-1]),
+        "velocity_theta": np.arctan2(*np.diff(yx, axis=0, prepend=yx[:1]).T),
         "dist_to_center_px": np.linalg.norm(centroid - _middle_px(session), axis=1),
     }
-    return pd.DataFrame(table)
+    return pd.DataFrame(table | {name: kept[name] for name in kept})
 
 
 def _shape(height: Array, is_read: NDArray[np.bool_]) -> tuple[float, ...]:
     """Centroid u, v px, direction rad, length, width px, area px and height mm; NaN for none."""
-    kept = is_read & (height >= _LOW_MM) & (height <= _HIGH_MM)
+    kept = is_read & (height >= _LOW_MM) & (height < _HIGH_MM + 1)  # whole mm, cut off below
     smooth = cv2.medianBlur(np.where(kept, height, 0).astype(np.uint8), 3)
     smooth = cv2.morphologyEx(smooth, cv2.MORPH_OPEN, _TAIL)
     mask = (smooth > _LOW_MM).astype(np.uint8)
@@ -120,10 +123,12 @@ def _shape(height: Array, is_read: NDArray[np.bool_]) -> tuple[float, ...]:
     root = np.hypot(2 * c, a - b)
     long, short = (2 * np.sqrt(2 * max((a + b + sign * root) / m, 0)) for sign in (1, -1))
     u, v = moments["m10"] / m, moments["m01"] / m
-    left, top = int(max(u - _HALF_PX, 0)), int(max(v - _HALF_PX, 0))
-    own = smooth[top : int(v) + _HALF_PX, left : int(u) + _HALF_PX]
+    angle = -0.5 * np.arctan2(2 * c, a - b)
+    turn = cv2.getRotationMatrix2D((_HALF_PX, _HALF_PX), -float(np.degrees(angle)), 1)
+    turn[:, 2] -= turn[:, :2] @ np.trunc(np.array([u, v]) - _HALF_PX)
+    own = cv2.warpAffine(smooth, turn, (2 * _HALF_PX, 2 * _HALF_PX))
     own = own[(own > _LOW_MM) & (own < _HIGH_MM)]
-    return u, v, -0.5 * np.arctan2(2 * c, a - b), long, short, len(own), own.mean()
+    return u, v, angle, long, short, len(own), own.mean() if len(own) else np.nan
 
 
 def _unwrapped(angle: Array) -> Array:
@@ -135,6 +140,8 @@ def _unwrapped(angle: Array) -> Array:
 
 def _middle_px(session: Session) -> Array:
     """Pixel (2,) of the arena's centre on the floor; NaN where the arena's shape is not known."""
+    if stated := session.metadata["input"].get("profile", {}).get("moseq_middle_px"):
+        return np.array(stated)  # of the box about MoSeq's region
     if session.arena.centre_mm is None:
         return np.full(2, np.nan)
     into = session.T_arena_camera.inverse()

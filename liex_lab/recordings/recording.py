@@ -168,6 +168,8 @@ class Recording:
         truncated: True if the file is cut or damaged.
         metadata: facts that the files state, such as subject_id and session_start_time (ISO 8601
             with zone).
+        measured: what the files state of each stored frame, measured by another program, by name;
+            see `measurements`.
         optics: corrections applied on reading (distortion, water, mirroring), empty if none; see
             `rectify`.
         unpacked: folder with the unpacked archive, which opens as the same recording while this one
@@ -220,6 +222,7 @@ class Recording:
         self.problems += [doubt for doubt in self.doubts if doubt not in self.problems]
         self.truncated = truncated
         self.metadata: dict[str, Any] = {} if metadata is None else dict(metadata)
+        self.measured: dict[str, NDArray[np.float64]] = {}
         self.optics: dict[str, Any] = {}
         self.region_px: tuple[tuple[float, float], ...] = ()
         self.unpacked = unpacked
@@ -252,6 +255,11 @@ class Recording:
     def stamp_faults(self) -> NDArray[np.uint8]:
         """(n,) which stamps were moved and why, an index into `timestamps.FAULTS`; a copy."""
         return self._faults.copy()
+
+    @property
+    def measurements(self) -> dict[str, NDArray[np.float64]]:
+        """What the files state of each frame (n,), measured by another program, by name."""
+        return {name: values[self._stored] for name, values in self.measured.items()}
 
     @property
     def n_whole(self) -> int:
@@ -421,6 +429,7 @@ class Recording:
         )
         cut._whole = self._whole or self
         cut.optics = self.optics
+        cut.measured = self.measured
         cut.region_px = self.region_px
         return cut
 
@@ -465,6 +474,7 @@ class Recording:
         )
         other._whole = self._whole or self
         other.optics = optics
+        other.measured = self.measured
         return other
 
     def masked(self, region_px: Sequence[Sequence[float]], *, lent: bool = False) -> Recording:

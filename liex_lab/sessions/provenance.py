@@ -66,6 +66,7 @@ class Provenance:
         plan_toml: the resolved plan, TOML text.
         format: the recording's format.
         profile: interpretation of the stored numbers, if a profile states it.
+        measured: (n,) numbers of each frame that another program measured, by name.
         individual: the animal's name in the session.
         n_frames: expected number of frames; None if unknown.
         gaps: frames that the camera did not deliver, and moved timestamps.
@@ -110,6 +111,7 @@ class Provenance:
     replay_depth: str = "all"
     replay_candidates: bool = False
     background: NDArray[np.uint16] | None = field(default=None, compare=False)
+    measured: dict[str, NDArray[np.float64]] = field(default_factory=dict, compare=False)
 
     @staticmethod
     def of(
@@ -138,6 +140,7 @@ class Provenance:
             "plan_toml": plan.to_toml(),
             "format": recording.format,
             "profile": dict(entries.get("profile", {})),
+            "measured": recording.measurements,
             "individual": stated.individual,
             "n_frames": len(recording),
             "gaps": [*recording.gaps, *recording.faults],

@@ -61,6 +61,7 @@ FILES = {  # of a session, and whether every version writes it
     "interactions.parquet": False,
     "interaction_totals.parquet": False,
     "triggers.parquet": False,
+    "moseq.parquet": False,
     "columns.json": True,
     "session.rrd": True,
     "session.mcap": True,

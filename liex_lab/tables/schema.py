@@ -149,6 +149,7 @@ INTERACTIONS = table_columns("interactions") + table_columns("interaction_totals
 EVENTS = table_columns("events")  # of another instrument
 DAYS = table_columns("hours") + table_columns("rhythm")  # of sessions with [light] in the plan
 TRIGGERS = table_columns("triggers")  # of a live recording
+MOSEQ = table_columns("moseq")  # of an extraction by MoSeq
 POINTS = table_columns("points")  # of an export; no session contains it
 # of each pair of the root's coordinates, row by row of the upper triangle
 ROOT_COVARIANCES = tuple(column.name for column in ROTATIONS if column.name.startswith("cov_"))
@@ -161,9 +162,9 @@ def all_columns() -> dict[str, Column]:
         for animal, kind in (("mouse", "stands"), ("fish", "swims"), ("hand", "branches"))
     )
     tables = chain(
-        *TABLES.values(), *SYNCED.values(), CROSSINGS, INTERACTIONS, EVENTS, DAYS, TRIGGERS, POINTS
+        *TABLES.values(), *SYNCED.values(), CROSSINGS, INTERACTIONS, EVENTS, DAYS, TRIGGERS, MOSEQ
     )
-    every = chain(tables, branching, swimming, walking)
+    every = chain(tables, POINTS, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 
 

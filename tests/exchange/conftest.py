@@ -17,6 +17,7 @@ _PEERS = {
     "test_peers.py": ("movement", "sleap_io"),
     "test_boris_reads.py": ("boris",),
     "test_dandi.py": ("dandi",),
+    "test_spikeinterface.py": ("spikeinterface",),
 }
 collect_ignore = [
     file for file, packages in _PEERS.items() if not all(find_spec(name) for name in packages)

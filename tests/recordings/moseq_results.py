@@ -64,8 +64,12 @@ def write_results(
     places: NDArray[np.float64] | None = None,
     acquisition: dict[str, Any] | None = None,
     floor: float | None = None,
+    stored: dict[str, NDArray[Any]] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Write the file; returns its scalars. places: (n, 3) centroid x, y in the crop and angle."""
+    """Write the file; returns the scalars of these frames.
+
+    places: (n, 3) centroid x, y in the crop and angle; stored: scalars that the file holds instead.
+    """
     n = len(depth)
     floor = floor or float(np.median(background[roi]))
     high = [heights(one, background, roi) for one in depth]
@@ -102,7 +106,7 @@ def write_results(
         "velocity_theta": np.arctan2(steps["mm"][:, 1], steps["mm"][:, 0]),
     }
     with h5py.File(path, "w") as file:
-        for name, values in scalars.items():
+        for name, values in (scalars | (stored or {})).items():
             file.create_dataset(f"scalars/{name}", data=values.astype("f4"), compression="gzip")
         file.create_dataset("timestamps", data=times_ms, compression="gzip")
         file.create_dataset("frames", data=cuts, compression="gzip")
