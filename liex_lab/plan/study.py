@@ -347,7 +347,8 @@ class Study:
         if not recording.startswith(VIRTUAL):
             recording = str(self.inside(recording, f"the recording of {id}"))
         # NeuroBlueprint's name of the folder of behavioural data
-        folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / "behav"
+        folder = self.results / f"sub-{'-'.join(one.names)}" / f"ses-{one.session}" / "behav"
+        folder = folder / f"{animal.id}.liex" if one.animals else folder
         plan = self._plan(animal, one, id)
         return PlannedSession(id, animal, recording, folder, plan, one.exclude)
 
