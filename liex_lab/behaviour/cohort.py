@@ -273,7 +273,7 @@ def _check_together(rows: pd.DataFrame, measure: str, units: Units) -> None:
     if measure.startswith(PAIR):
         if units.unit != CAGE and rows["arena"].duplicated().any():
             raise NotComparable(
-                f"{measure} is of the arena and the same for all its animals, which are of both "
+                "a measure of the arena is the same for all its animals, which are of both "
                 "groups; compare arenas of one group each"
             )
     elif doubtful := sorted(set(rows.loc[rows["exchanged"].eq(True), "arena"])):
