@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.interactions import Individual, find_interactions
-from liex_lab.errors import LiexError, RecordingError
+from liex_lab.errors import LiexError, PlanError, RecordingError
 from liex_lab.plan import Plan, sections
 from liex_lab.plan.plan import toml_value
 from liex_lab.recordings.frame import DepthFrame
@@ -77,6 +77,7 @@ def run_arenas(
     workers: int = 1,
     pool: processes.WorkerPool | None = None,
     report: bool = True,
+    animals: Sequence[tuple[Path, sections.SessionFacts]] = (),
     progress: Progress = silent,
 ) -> list[ArenaOutcome]:
     """Measure several arenas in one image, or several animals in one arena, a session each.
@@ -93,6 +94,8 @@ def run_arenas(
             measures all arenas in one pass.
         pool: a worker pool to use instead.
         report: whether to write each session's report with its figures.
+        animals: folder and facts of each of several animals in one arena, the largest first, if
+            they are known; () names them animal1 and so on.
         progress: receives progress reports.
 
     Returns:
@@ -104,7 +107,7 @@ def run_arenas(
     first = plan or Plan.load(USUAL).with_settings(settings)
     if first.arenas is None:
         return _run_animals(
-            recording, plan, first, Path(out), settings, overwrite, notes, report, progress
+            recording, plan, first, Path(out), settings, overwrite, notes, report, animals, progress
         )
     pool = pool or processes.processes_for(workers or 1)
     outcomes: dict[str, ArenaOutcome] = {}
@@ -195,6 +198,7 @@ def _run_animals(
     overwrite: bool,
     notes: Mapping[str, Any] | None,
     report: bool,
+    named: Sequence[tuple[Path, sections.SessionFacts]],
     progress: Progress,
 ) -> list[ArenaOutcome]:
     """Measure the animals of one arena, see `run_arenas`; `first` is the plan with its settings."""
@@ -219,17 +223,22 @@ def _run_animals(
                 arena, _ = build_arena(fitted.tracker.scene, fitted.plan)
                 last_s = 1e-9 * float(opened.times_ns[-1] - opened.times_ns[0])
                 readings = read_readings(rfid, last_s, count, arena)
+            if not named and fitted.plan.session.subject_id:
+                raise PlanError(
+                    f"session.subject_id is one animal's, and {count} are measured; name each "
+                    "afterwards with `liex describe`, or in a study (docs/tutorials/study.md)"
+                )
             name = fitted.plan.session.name or opened.name
-            folders = [durable.inside(out, f"{name}-animal{k + 1}", ".liex") for k in range(count)]
-            for folder in folders:
+            for k in range(1, count + 1 if not named else 0):
+                stated = {"name": f"{name}-animal{k}", "individual": f"animal{k}"}
+                facts = fitted.plan.session.model_copy(update=stated)
+                named = [*named, (durable.inside(out, stated["name"], ".liex"), facts)]
+            for folder, _ in named:
                 check_unused(folder, overwrite)
-            for k, (tracker, folder) in enumerate(zip(joint.trackers, folders, strict=True), 1):
-                stated = [
-                    f"session.name={toml_value(folder.stem)}",
-                    f"session.individual=animal{k}",
-                ]
-                own = replace(fitted, plan=fitted.plan.with_settings(stated), tracker=tracker)
-                going[f"animal{k}"] = prepare(own, folder, started, progress)
+            for tracker, (folder, facts) in zip(joint.trackers, named, strict=True):
+                plan = fitted.plan.model_copy(update={"session": facts})
+                own = replace(fitted, plan=plan, tracker=tracker)
+                going[facts.individual] = prepare(own, folder, started, progress)
             sessions = _measure_animals(
                 going, joint, readings, recording, overwrite, notes, report, progress
             )

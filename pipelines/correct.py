@@ -174,14 +174,15 @@ def _write(
             progress(0, None, "measuring what was corrected")
             skeleton = evidence.skeleton_of(sessions[name])
             found[name] = corrected_track(sessions[name], log, skeleton, members)
-    together = _together(members, found) if len(found) > 1 else None
+    shared = len(found) > 1 or any(log.shared for log in logs.values())
+    together = _together(members, found, logs) if found and shared else None
     for name, log in logs.items():
         one = sessions[name]
         part = durable.unlinked(one.path / _PART)
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         if log.touched:
-            log = _apply(one, log, part, found[name], together)
+            log = _apply(one, log, part, found[name], together, len(logs) > 1)
         if log.described:
             _describe(one, log, part)
         if log.clock:
@@ -232,15 +233,28 @@ def _refuse_moved(session: Session, log: corrections.Log, names: Sequence[str]) 
 
 
 def _together(
-    members: Mapping[str, Session], found: Mapping[str, "CorrectedTrack"]
+    members: Mapping[str, Session],
+    found: Mapping[str, "CorrectedTrack"],
+    logs: Mapping[str, corrections.Log],
 ) -> Interactions | None:
-    """The interactions of the corrected tracks; None without a table of them."""
+    """The interactions of the corrected tracks; None without a table of them.
+
+    An animal without a new track has the measured one, or that of its session if its log stays.
+    """
     raw = next(iter(members.values()))
     if not raw.has("interactions.parquet"):
         return None
     return find_interactions(
         raw.frames["time_s"].to_numpy(float),
-        [Individual.of_track(name, one.track) for name, one in found.items()],
+        [
+            Individual.of_track(
+                name,
+                found[name].track
+                if name in found
+                else evidence.track_of(one if name in logs else Session.open(one.path)),
+            )
+            for name, one in members.items()
+        ],
         Plan.from_toml(raw.plan, "plan.toml").interactions,
         raw.frames["frame_index"].to_numpy(np.int64),
     )
@@ -282,10 +296,12 @@ def _apply(
     folder: Path,
     found: "CorrectedTrack",
     together: Interactions | None,
+    renewed: bool,
 ) -> corrections.Log:
     """Write the tables that differ from the session's, and a replay to overlay on the session's.
 
-    Returns the log that lists them.
+    Interactions are `renewed` only if the sessions of all animals are written. Returns the log that
+    lists the files.
     """
     origin = evidence.provenance_of(raw, found.track.skeleton)
     index = raw.frames["frame_index"].to_numpy()
@@ -296,16 +312,16 @@ def _apply(
     behaviour, facts = _behaviour(raw, log, found, results)
     written = behaviour.tables
     problems = [*raw.metadata["problems"], *found.remarks]
-    if together is not None:
+    if together is not None and renewed:
         written = {**written, **together.for_session(rows, behaviour.tables)["results"]}
-    elif log.shared:  # as they were when identities were corrected last
+    elif together is not None:  # as they were when identities were corrected last
         for name in INTERACTION_TABLES:
             shutil.copy2(Session.open(raw.path).file(f"{name}.parquet"), folder)
     if log.shared or len(found.turned) or len(found.moved):
         results.write_track(folder)
         facts["frames"] = results.counts()
         measured = (corrections.FlipSpan, corrections.JointMove)
-        has_before = together is None and raw.has("interactions.parquet")
+        has_before = not renewed and raw.has("interactions.parquet")
         if has_before and any(isinstance(one.what, measured) for one in log.standing):
             problems.append(_BEFORE)
     else:
@@ -324,7 +340,12 @@ def _apply(
         facts["verdict"] = _verdict(raw, found)
     layout = replay_blueprint({**raw.metadata, **facts})
     rrd.ReplayWriter(folder / corrections.REPLAY, origin, layout, corrected=True).finish(
-        rows, behaviour.kinematics, behaviour.bouts, list(behaviour.actions), ()
+        rows,
+        behaviour.kinematics,
+        behaviour.bouts,
+        list(behaviour.actions),
+        (),
+        together=together,
     )
     return replace(log, facts=facts)
 

@@ -15,7 +15,7 @@ from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.text_files import value_at
 from liex_lab.scene.height_maps import N_OBJECTS
 from liex_lab.sessions import Session, cutouts, rrd_scene, viewer
-from liex_lab.sessions.rrd import OVERLAY, SKELETON, corrected_entity
+from liex_lab.sessions.rrd import OVERLAY, SKELETON, TOGETHER, corrected_entity
 
 
 def write_blueprint(session: Session) -> Path:
@@ -57,8 +57,10 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     animal = session["animal"]
     corrected = bool(session.get("corrections"))
     at = corrected_entity if corrected else str
-    # the other animals of the arena are as they were measured
-    measured = ["skeleton", "body", "uncertainty", "root", "animals"] if corrected else []
+    # without an exchange the other animals of the arena are as they were measured
+    moved = bool((session.get("corrections") or {}).get("swap"))
+    measured = ["skeleton", "body", "uncertainty", "root"] if corrected else []
+    measured += ["animals"] * moved
     body_m = float(animal.get("spine_mm") or animal["home_length_mm"]) / 1000.0
     hidden = [OVERLAY, corrected_entity(OVERLAY), *(f"arena/{name}" for name in measured)]
     scene = _scene(body_m, at(SKELETON), ["$origin/**", *(f"- /{name}/**" for name in hidden)])
@@ -78,7 +80,8 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
         contents=[
             "$origin/**",
             f"+ /{rrd_scene.CUTOUTS}/**",
-            *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones", "animals/**") if corrected),
+            *(f"- /{OVERLAY}/{name}" for name in ("joints", "bones") if corrected),
+            *[f"- /{OVERLAY}/animals/**"] * moved,
         ],
         overrides={} if kept in (cutouts.ALL, cutouts.NONE) else frames,
         name="depth with the corrected skeleton" if corrected else "depth with the fitted skeleton",
@@ -93,7 +96,7 @@ def replay_blueprint(session: dict[str, Any]) -> Any:
     return _blueprint(
         rrb.Vertical(
             rrb.Horizontal(scene, image),
-            *_over_time(at, animal),
+            *_over_time(at, animal, [] if moved else [f"+ /{TOGETHER}/**"]),
             row_shares=[5, 1.6 * n_boxes / 2, 2],
         )
     )
@@ -125,15 +128,20 @@ def _scene(body_m: float, skeleton: str, contents: Any = "$origin/**") -> Any:
     )
 
 
-def _over_time(at: Callable[[str], str], animal: dict[str, Any]) -> tuple[Any, Any]:
+def _over_time(
+    at: Callable[[str], str], animal: dict[str, Any], more: list[str]
+) -> tuple[Any, Any]:
     """The lanes of actions, and the curves below them with the list of messages.
 
     Args:
         at: the entity to show for a measured one.
         animal: the section of that name of session.json; its joints determine the curves.
+        more: further contents of the lanes.
     """
     lanes = rrb.StateTimelineView(
-        origin=at("ethogram"), name="actions (predicted) and frames to distrust (tracking)"
+        origin=at("ethogram"),
+        contents=["$origin/**", *more],
+        name="actions (predicted) and frames to distrust (tracking)",
     )
     shown = drawn_measures(animal)
     curves = rrb.Horizontal(

@@ -16,6 +16,7 @@ from liex_lab.optics.camera import SensorCard
 from liex_lab.runtime.durable import write_whole
 from liex_lab.sessions import Session, correcting, verdict
 from liex_lab.sessions.session import found_video
+from liex_lab.tracking import identity
 from liex_lab.tracking.track import DOUBTFUL
 
 from ..figures.animals import FRAMES, KINEMATICS
@@ -95,6 +96,8 @@ def warnings(session: Session) -> list[str]:
         error=error,
         spine=spine,
         flips=session.flips,
+        crossings=_crossings(session),
+        unclear=identity.UNCLEAR,
         disagreements=correcting.disagreements(session),
         behaviour=behaviour,
         noise=noise,
@@ -275,6 +278,7 @@ def render(session: Session, figures: Path | None = None) -> str:
         warnings=warnings(session),
         account=frame_account(session),
         flips=likely.to_dict("records"),
+        crossings=_crossings(session),
         thumbnails=thumbnails(session),
         whole_image=whole_image(session),
         n_animals=_unmeasured(about) + 1,
@@ -309,6 +313,12 @@ def _unmeasured(about: Mapping[str, Any]) -> int:
     """How many animals are in view and not measured, by the content of session.json."""
     found = about.get("verdict") or {}
     return max(0, int(found.get("n_animals", 1)) - int(found.get("n_measured", 1)))
+
+
+def _crossings(session: Session) -> list[dict[Hashable, Any]]:
+    """The crossings of several animals."""
+    known = session.has("crossings.parquet")
+    return session.crossings.to_dict("records") if known else []
 
 
 def interaction_rows(session: Session) -> dict[str, list[str]]:

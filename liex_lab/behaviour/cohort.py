@@ -86,9 +86,12 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
 def _together(session: SessionTables) -> dict[str, Any]:
     """What the rows of the animals of one arena also have; nothing for one animal."""
     about = session.metadata
-    if len((about.get("interactions") or {}).get("individuals", ())) < 2:
+    names = (about.get("interactions") or {}).get("individuals", ())
+    if len(names) < 2:
         return {}
-    name = str(about["session_id"]).removesuffix(f"-{about['individual']}")
+    own = str(about["session_id"])
+    name = own.removesuffix(f"-{about['individual']}")
+    name = ", ".join(names) if name == own else name  # of a study: each has a name of its own
     known = "crossings.parquet" in about.get("files", {})
     swaps = session.table("crossings")["p_swap"].to_numpy(float) if known else np.empty(0)
     return {
@@ -270,7 +273,7 @@ def _check_together(rows: pd.DataFrame, measure: str, units: Units) -> None:
     if measure.startswith(PAIR):
         if units.unit != CAGE and rows["arena"].duplicated().any():
             raise NotComparable(
-                f"{measure} is of the arena and the same for all its animals, which are of both "
+                "a measure of the arena is the same for all its animals, which are of both "
                 "groups; compare arenas of one group each"
             )
     elif doubtful := sorted(set(rows.loc[rows["exchanged"].eq(True), "arena"])):

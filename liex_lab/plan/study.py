@@ -11,7 +11,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from pathlib import Path, PurePosixPath
@@ -81,10 +81,11 @@ class StudyArena(ArenaPlace):
 
 
 class StudySession(SettingsTable):
-    """One recording of one animal, a table [[sessions]].
+    """One recording, a table [[sessions]].
 
     Attributes:
-        animal: id of the animal.
+        animal: id of the animal, if it is alone.
+        animals: ids of several animals in one arena, the largest first.
         session: letters and digits, with key-value pairs after them, as in 01_date-20260821.
         recording: path below the study's folder, or address of a virtual recording; a pattern such
             as rawdata/m01/cam1_*.mcap is one recording in several files.
@@ -95,7 +96,8 @@ class StudySession(SettingsTable):
         set: settings of the plan for this session, nested.
     """
 
-    animal: Name
+    animal: Name = ""
+    animals: list[Name] = Field(default_factory=list, min_length=2, max_length=4)
     session: SessionName
     recording: PathText
     plan: PathText | None = None
@@ -103,6 +105,11 @@ class StudySession(SettingsTable):
     start_time: str | None = None
     exclude: Text = ""
     set: Settings = Field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        """Ids of its animals."""
+        return self.animals or [self.animal]
 
 
 class StudyTable(SettingsTable):
@@ -134,32 +141,41 @@ class StudyTable(SettingsTable):
         arenas = [arena.name for arena in self.arenas]
         recorded = Counter((one.arena, one.recording) for one in self.sessions if one.arena)
         twice = first_twice(ids)
-        named = first_twice(f"{one.animal} has two sessions {one.session}" for one in self.sessions)
+        each = [(name, one) for one in self.sessions for name in one.names]
+        named = first_twice(f"{name} has two sessions {one.session}" for name, one in each)
         refuse(
             ValueError,
             (twice, f"the animal {twice} is listed twice; keep one"),
             (first_twice(arenas), "two [[arenas]] have the same name; give each its own"),
             *(
                 (
-                    one.animal not in ids,
-                    f"the session {one.session} is of {one.animal}, an animal that is not in "
-                    "[[animals]]",
+                    bool(one.animal) == bool(one.animals),
+                    f"the session {one.session} of {one.recording} should name its animal, as in "
+                    'animal = "m01", or several of one arena, the largest first, as in animals = '
+                    '["m01", "m02"]',
                 )
                 for one in self.sessions
             ),
             *(
                 (
+                    name not in ids,
+                    f"the session {one.session} is of {name}, an animal that is not in [[animals]]",
+                )
+                for name, one in each
+            ),
+            *(
+                (
                     one.arena and one.arena not in arenas,
-                    f"the session {one.session} of {one.animal} is in the arena {one.arena}, which "
-                    "is not in [[arenas]]",
+                    f"the session {one.session} of {one.names[0]} is in the arena {one.arena}, "
+                    "which is not in [[arenas]]",
                 )
                 for one in self.sessions
             ),
             *(
                 (
                     n > 1,
-                    f"two sessions are of the arena {arena} in {recording}; an arena holds one "
-                    "animal",
+                    f"two sessions are of the arena {arena} in {recording}; one session lists all "
+                    "animals of an arena",
                 )
                 for (arena, recording), n in recorded.items()
             ),
@@ -180,6 +196,8 @@ class PlannedSession:
         plan: all settings, resolved.
         exclude: reason for excluding it; empty if included.
         remark: an extra remark for session.json; may be empty.
+        arena: the sessions of all animals of its arena, which are measured together, the largest
+            animal first; () if it is alone.
     """
 
     id: str
@@ -189,6 +207,12 @@ class PlannedSession:
     plan: Plan
     exclude: str = ""
     remark: str = ""
+    arena: tuple[PlannedSession, ...] = ()
+
+    @property
+    def together(self) -> tuple[PlannedSession, ...]:
+        """The sessions that are measured with it, itself among them."""
+        return self.arena or (self,)
 
     @property
     def recording_exists(self) -> bool:
@@ -254,7 +278,7 @@ class Study:
         except ValidationError as error:
             raise StudyError(f"{path}: {_sentence(error)}") from None
         for one in study.table.sessions:
-            what = f"the recording of {one.animal} {one.session}"
+            what = f"the recording of {', '.join(one.names)} {one.session}"
             if not one.recording.startswith(VIRTUAL):
                 study.inside(one.recording, what)
             for key, value in parse_qsl(one.recording.partition("?")[2]):
@@ -302,18 +326,31 @@ class Study:
             PlanError: a named plan is invalid.
         """
         animals = {animal.id: animal for animal in self.table.animals}
-        planned = []
+        planned: list[PlannedSession] = []
         for one in self.table.sessions:
-            animal = animals[one.animal]
-            id = f"sub-{animal.id}_ses-{one.session}"
-            recording = one.recording
-            if not recording.startswith(VIRTUAL):
-                recording = str(self.inside(recording, f"the recording of {id}"))
-            # NeuroBlueprint's name of the folder of behavioural data
-            folder = self.results / f"sub-{animal.id}" / f"ses-{one.session}" / "behav"
-            plan = self._plan(animal, one, id)
-            planned.append(PlannedSession(id, animal, recording, folder, plan, one.exclude))
+            own = [self._planned(animals[name], one) for name in one.names]
+            several = tuple(own) if len(own) > 1 else ()
+            plans = [each.plan.model_copy(update={"session": own[0].plan.session}) for each in own]
+            if plans != plans[:1] * len(plans):
+                raise StudyError(
+                    f"{self.path}, session {own[0].id}: {', '.join(one.names)} are measured "
+                    "together, and their settings differ; move them from `set` of the animal to "
+                    "`set` of the session"
+                )
+            planned += [replace(each, arena=several) for each in own]
         return tuple(planned)
+
+    def _planned(self, animal: StudyAnimal, one: StudySession) -> PlannedSession:
+        """The session of one animal."""
+        id = f"sub-{animal.id}_ses-{one.session}"
+        recording = one.recording
+        if not recording.startswith(VIRTUAL):
+            recording = str(self.inside(recording, f"the recording of {id}"))
+        # NeuroBlueprint's name of the folder of behavioural data
+        folder = self.results / f"sub-{'-'.join(one.names)}" / f"ses-{one.session}" / "behav"
+        folder = folder / f"{animal.id}.liex" if one.animals else folder
+        plan = self._plan(animal, one, id)
+        return PlannedSession(id, animal, recording, folder, plan, one.exclude)
 
     def inside(self, text: str, what: str) -> Path:
         """Full path of a path in the study file, which must stay in the study's folder.
@@ -347,7 +384,8 @@ class Study:
         if arena is not None:
             region = arena.region.model_dump(exclude_none=True)
             where = merged(arena.set, {"arena": {"region": region}})
-        for settings in (self.table.set, where, animal.set, {"session": facts}, one.set):
+        number: Settings = {"animal": {"count": len(one.animals)}} if one.animals else {}
+        for settings in (self.table.set, where, animal.set, {"session": facts}, number, one.set):
             table = merged(table, settings)
         # settings that may name a file
         for section, key in (("arena", "zones"), ("estimation", "model"), ("animal", "skeleton")):
@@ -363,9 +401,24 @@ class Study:
                 "of [[sessions]]"
             )
         try:
-            return Plan.from_table(table, f"{self.path}, session {id}")
+            plan = Plan.from_table(table, f"{self.path}, session {id}")
         except PlanError as error:
             raise StudyError(str(error)) from None
+        refuse(
+            StudyError,
+            (
+                plan.animal.count != len(one.names),
+                f"{self.path}, session {id}: animal.count is {plan.animal.count}, and the session "
+                f"names {len(one.names)}; list the animals of the arena, the largest first, as in "
+                'animals = ["m01", "m02"]',
+            ),
+            (
+                plan.animal.rfid is not None,
+                f"{self.path}, session {id}: animal.rfid names the animals itself, so measure this "
+                "recording with `liex run`; `liex compare` takes its sessions, too",
+            ),
+        )
+        return plan
 
 
 def merged(table: Settings, settings: Settings) -> Settings:

@@ -21,6 +21,7 @@ from liex_lab.runtime import processes, text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import corrections, folder
 
+from ..arenas import run_arenas
 from .status import (
     INSPECTING,
     InspectSession,
@@ -46,7 +47,7 @@ def measure_one(
     run_id: str = "",
     pool: processes.WorkerPool | None = None,
 ) -> dict[str, Any]:
-    """Measure a session, or quarantine it, and report the result.
+    """Measure a session with those of its arena, or quarantine them, and report the result.
 
     It may safely run twice: an interrupted session resumes, and an existing one is replaced once
     the new one is complete.
@@ -73,27 +74,31 @@ def measure_one(
                 f"there is no recording {session.recording}; correct its path, or copy it there"
             )
 
-        run(
-            session.recording,
-            session.plan,
-            folder=session.folder,
-            overwrite=True,
-            notes={
-                "input": {"stamp": input_stamp(session.recording)},
-                "run_id": run_id,
-                **({"problems": [session.remark]} if session.remark else {}),
-            },
-            pool=pool,
-            progress=stage,
-        )
+        notes = {
+            "input": {"stamp": input_stamp(session.recording)},
+            "run_id": run_id,
+            **({"problems": [session.remark]} if session.remark else {}),
+        }
+        common: dict[str, Any] = {
+            "overwrite": True,
+            "notes": notes,
+            "pool": pool,
+            "progress": stage,
+        }
+        if session.arena:
+            named = [(one.folder, one.plan.session) for one in session.arena]
+            run_arenas(session.recording, session.plan, animals=named, **common)
+        else:
+            run(session.recording, session.plan, folder=session.folder, **common)
     except Exception as error:
         failure = folder.describe_failure(error, stage.name, stage.frame) | {"run_id": run_id}
         return quarantine(session, failure) | {"seconds": round(time.perf_counter() - began, 3)}
+    reviews = [review_note(corrections.read_verdict(one.folder)) for one in session.together]
     return {
         **_result(session, "done"),
         "seconds": round(time.perf_counter() - began, 3),
         "corrections_taken_from": folder.taken_from(session.folder),
-        "review": review_note(corrections.read_verdict(session.folder)),
+        "review": "; ".join(dict.fromkeys(filter(None, reviews))),
     }
 
 
@@ -113,18 +118,20 @@ def _ended(session: PlannedSession, run_id: str) -> dict[str, Any] | None:
 
 
 def quarantine(session: PlannedSession, failure: dict[str, Any]) -> dict[str, Any]:
-    """Write failed.json into the session's folder, and set older results aside.
+    """Write failed.json into the folders of the sessions that are measured with it, and set older
+    results aside.
 
     The file contains plan and input, to detect changes. Returns the session's result.
     """
-    known = {
-        "session_id": session.id,
-        **failure,
-        "plan": session.plan.model_dump(exclude_none=True),
-        "input": {"stamp": input_stamp(session.recording)},
-    }
-    folder.set_outdated(session.folder)
-    folder.write_failure(session.folder, known)
+    for one in session.together:
+        known = {
+            "session_id": one.id,
+            **failure,
+            "plan": one.plan.model_dump(exclude_none=True),
+            "input": {"stamp": input_stamp(one.recording)},
+        }
+        folder.set_outdated(one.folder)
+        folder.write_failure(one.folder, known)
     return _result(session, "failed", failure)
 
 

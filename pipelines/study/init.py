@@ -38,6 +38,7 @@ _HEADER = """\
 #     liex cohort {file} --dry-run      shows what will be done, and why
 #     liex cohort {file}                does it, goes on after any interruption, and leaves out what is done
 # Paths count from this file's folder and stay in it. Nothing is ever written into {raw}.
+# A session of several animals in one arena lists them, the largest first: animals = ["m01", "m02"]
 # [set], and `set` of an animal or a session, change values of the plan: set = {{ animal.spine_mm = 65 }}
 """  # noqa: E501
 _SETTINGS = f"""\

@@ -254,15 +254,21 @@ def run_study(
                         corrections.Description(key, value) for key, value in one.described.items()
                     ]
                     describe(one.session.folder, descriptions, author=f"study {study.name}")
-            if (todo := _to_measure(before)) and crew:
+            if (todo := to_measure(before)) and crew:
                 _measure(todo, run, crew, board)
         after = standings(study)
         write_study_table(study, after)
     return after
 
 
-def _to_measure(found: Sequence[SessionStatus]) -> list[SessionStatus]:
-    return [one for one in found if one.to_do and not one.described]
+def to_measure(found: Sequence[SessionStatus]) -> list[SessionStatus]:
+    """The sessions to measure; of those that are measured together, one.
+
+    Args:
+        found: the status of every session.
+    """
+    todo = [one for one in found if one.to_do and not one.described]
+    return list({one.session.together[0].id: one for one in reversed(todo)}.values())[::-1]
 
 
 @contextmanager
@@ -270,7 +276,7 @@ def _crew(
     found: Sequence[SessionStatus], pending: Sequence[PlannedSession], **where: Any
 ) -> Iterator[Crew | None]:
     """Workers for the pending sessions; None if there are none."""
-    todo = [one.session for one in _to_measure(found)]
+    todo = [one.session for one in to_measure(found)]
     if not todo and not pending:
         yield None
         return

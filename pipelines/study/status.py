@@ -177,7 +177,7 @@ def _groups(study: Study) -> list[list[PlannedSession]]:
     groups: dict[tuple[str, str, str], list[PlannedSession]] = {}
     for session in study.sessions:
         plan = session.plan
-        if not session.exclude and plan.animal.shared is None:
+        if not session.exclude and not session.arena and plan.animal.shared is None:
             key = session.animal.id, plan.animal.skeleton, plan.estimation.model
             groups.setdefault(key, []).append(session)
     return [group for group in groups.values() if len(group) > 1]
@@ -460,7 +460,9 @@ def to_check(found: Sequence[SessionStatus]) -> list[str]:
     notes = [*misnamed(sessions), *unified(table)[1]]
     known: dict[str, str] = {}
     for one in (one for one in found if one.input):
-        first = known.setdefault(f"{one.input} {one.session.plan.arena.region}", one.session.id)
+        own = one.session.animal.id if one.session.arena else ""
+        mark = f"{one.input} {one.session.plan.arena.region} {own}"
+        first = known.setdefault(mark, one.session.id)
         if first != one.session.id:
             notes.append(f"{one.session.id} is of the same recording as {first}")
     return notes
@@ -469,11 +471,11 @@ def to_check(found: Sequence[SessionStatus]) -> list[str]:
 def misnamed(sessions: Sequence[PlannedSession]) -> list[str]:
     """Sentences on sessions whose recordings are named after another animal of the study.
 
-    Sessions with a region, as one of several arenas, are skipped.
+    Sessions with a region, as one of several arenas, or with several animals are skipped.
     """
     known = {same(one.animal.id): one.animal.id for one in sessions}
     notes = []
-    for one in (one for one in sessions if one.plan.arena.region is None):
+    for one in (one for one in sessions if one.plan.arena.region is None and not one.arena):
         found = find_subject(Path(one.recording))
         other = known.get(same(found.id)) if found.origin else None
         if other not in (None, one.animal.id):

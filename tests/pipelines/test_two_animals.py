@@ -6,10 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from liex_lab.pipelines.convert import convert
+from liex_lab.pipelines.session import run_session
+from liex_lab.pipelines.study.crew import measure_one
+from liex_lab.pipelines.study.run import to_measure
+from liex_lab.pipelines.study.status import standings, to_check
 from typer.testing import CliRunner
 
 from liex_lab import cli
+from liex_lab.behaviour.cohort import collect
+from liex_lab.plan.study import Study
 from liex_lab.sessions import Session
+from liex_lab.sessions.individuals import by_arena
 from liex_lab.simulation.scenes.catalogue import film
 
 N_FRAMES = 60
@@ -106,3 +113,28 @@ def test_both_are_measured_each_in_a_session_of_its_own(recording: Path, tmp_pat
         assert min(off) < 10.0
         nearest.append(int(np.argmin(off)))
     assert sorted(nearest) == [0, 1]
+
+
+def test_a_study_measures_both_at_once_and_counts_their_arena_once(
+    recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / recording.name).symlink_to(recording)
+    (tmp_path / "study.toml").write_text(
+        'name = "pairs"\n[[animals]]\nid = "m1"\ngroup = "wt"\n[[animals]]\nid = "m2"\n'
+        'group = "ko"\n[[sessions]]\nanimals = ["m1", "m2"]\nsession = "01"\n'
+        f'recording = "{recording.name}"\n'
+    )
+    study = Study.load(tmp_path)
+    (todo,) = to_measure(standings(study))
+    result = measure_one(todo.session, run_session)
+    assert result["failure"] is None
+    done = standings(study)
+    assert [one.state for one in done] == ["done", "done"]
+    assert not to_check(done)
+    sessions = [Session.open(one.folder) for one in study.sessions]
+    (both,) = by_arena(sessions)
+    assert [one.metadata["individual"] for one in both] == ["m1", "m2"]
+    assert {*sessions[0].interactions["agent"]} <= {"m1", "m2"}
+    table = collect(sessions)
+    assert table["arena"].nunique() == 1
+    assert table["group"].tolist() == ["wt", "ko"]

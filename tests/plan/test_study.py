@@ -225,6 +225,65 @@ def test_animals_in_several_arenas_of_one_recording_are_sessions_of_their_own(
     assert (left.plan.session.subject_id, right.plan.session.subject_id) == ("m01", "m02")
 
 
+PAIRS = """
+set = { animal.spine_max_mm = 90 }
+[[animals]]
+id = "m01"
+group = "wt"
+[[animals]]
+id = "m02"
+group = "ko"
+[[sessions]]
+animals = ["m01", "m02"]
+session = "01"
+recording = "rawdata/box1.mcap"
+"""
+
+
+def test_the_animals_of_one_arena_are_sessions_that_are_measured_together(tmp_path: Path) -> None:
+    wt, ko = study_of(PAIRS, tmp_path).sessions
+    assert (wt.id, ko.id) == ("sub-m01_ses-01", "sub-m02_ses-01")
+    assert [one.id for one in wt.together] == [one.id for one in ko.together] == [wt.id, ko.id]
+    assert wt.plan.animal.count == ko.plan.animal.count == 2
+    facts = [(one.plan.session.subject_id, one.plan.session.group) for one in (wt, ko)]
+    assert facts == [("m01", "wt"), ("m02", "ko")]
+    assert wt.folder != ko.folder
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('animals = ["m01", "m02"]', "", "should name its animal"),
+        ('animals = ["m01", "m02"]', 'animal = "m01"\nanimals = ["m01", "m02"]', "should name"),
+        ('["m01", "m02"]', '["m01"]', "at least 2"),
+        ('["m01", "m02"]', '["m01", "m01"]', "two sessions"),
+        ('["m01", "m02"]', '["m01", "m03"]', "not in"),
+        ("animal.spine_max_mm = 90", "animal.count = 3", ""),
+        (
+            'animals = ["m01", "m02"]',
+            'animal = "m01"\nset = { animal.count = 2 }',
+            "animal.count is 2, and the session names 1; list the animals of the arena",
+        ),
+        ('group = "ko"', "set = { animal.spine_mm = 60 }", "their settings differ"),
+        (
+            "animal.spine_max_mm = 90",
+            'animal.rfid = { readings = "r.csv", tags = ["a"], '
+            "antennas = { A = { centre = [0, 0], radius = 40 } } }",
+            "names the animals itself",
+        ),
+    ],
+)
+def test_a_slip_in_the_animals_of_one_arena_is_told(
+    tmp_path: Path, old: str, new: str, says: str
+) -> None:
+    assert old in PAIRS
+    if not says:  # the number of names counts
+        assert study_of(PAIRS.replace(old, new), tmp_path).sessions[1].plan.animal.count == 2
+        return
+    with pytest.raises(StudyError, match=says):
+        read_whole(PAIRS.replace(old, new, 1), tmp_path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [

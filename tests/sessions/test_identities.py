@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from liex_lab.dashboards.report.report import render
 from liex_lab.pipelines.correct import correct_session
 from liex_lab.pipelines.session import conclude
 from typer.testing import CliRunner
@@ -18,13 +19,14 @@ from liex_lab.body.pose import Pose
 from liex_lab.errors import SessionError
 from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
-from liex_lab.sessions import Session, SessionWriter, correcting, identities
-from liex_lab.sessions.corrections import LogEntry, Roles, read_log, read_verdict
+from liex_lab.sessions import Session, SessionWriter, correcting, identities, rrd
+from liex_lab.sessions.corrections import REPLAY, LogEntry, Roles, read_log, read_verdict
 from liex_lab.sessions.verdict import Verdict
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.identity import doubt, flag_unclear
 from liex_lab.tracking.observations import Observations, reversed_pose
 from liex_lab.tracking.track import Crossing, Subject
+from tests.sessions.test_rrd import columns_of
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, steady
 
 N = 240
@@ -143,6 +145,31 @@ def test_every_table_of_both_animals_follows_and_can_be_taken_back(
     for one, before in zip(opened(pair), now, strict=True):
         assert len(one.log.shared) == 1
         np.testing.assert_array_equal(joints(one), joints(before))
+
+
+def test_the_corrected_replay_shows_the_other_animal_where_it_is_now(pair: list[Path]) -> None:
+    file = f"corrected/{REPLAY}"
+    entity = rrd.corrected_entity(f"{rrd.ANIMALS}/animal2/joints")
+    exchange(pair, 2.2)
+    for _ in range(2):  # after the exchange, and after an action of one animal alone
+        one, other = opened(pair)
+        there = [row for row in columns_of(one, entity, file)["Points3D:positions"] if row]
+        now = joints(other)[np.isfinite(joints(other)).all(axis=(1, 2))] / 1000.0
+        np.testing.assert_allclose(np.array(there), now, atol=1e-6)
+        lane = rrd.corrected_entity(rrd.TOGETHER + r"/animal2\ to\ animal1")
+        assert columns_of(one, lane, file)
+        correct_session(pair[0], [correcting.add_bout(one, "run", 4.0, 4.5)], report=False)
+
+
+def test_the_report_lists_what_is_open_and_what_was_reviewed(pair: list[Path]) -> None:
+    page = render(opened(pair)[0])
+    assert "may have been exchanged in 1 crossing, most likely at 2.00 s (probability 0.40)" in page
+    assert "<td>animal1, animal2</td><td>0.40</td><td>motion</td><td>–</td>" in page
+    assert "liex correct swap SESSION1 SESSION2" in page
+    page = render(exchange(pair, 2.2)[0])
+    assert "may have been exchanged in 1 crossing" not in page
+    assert "<td>animal1, animal2</td><td>0.00</td><td>human</td><td>ada</td>" in page
+    assert "liex correct swap SESSION1 SESSION2" not in page
 
 
 def test_a_crossing_that_was_checked_is_certain_in_both(

@@ -38,12 +38,12 @@ def strict():
     rerun.set_strict_mode(False)
 
 
-def columns_of(session, entity):
+def columns_of(session, entity, file="session.rrd"):
     """The rows of an entity: column name -> list over rows, static columns included."""
     from rerun.chunk import RrdReader
 
     found: dict[str, list] = {}
-    for chunk in RrdReader(session.path / "session.rrd").stream().filter(content=f"/{entity}"):
+    for chunk in RrdReader(session.path / file).stream().filter(content=f"/{entity}"):
         batch = chunk.to_record_batch()
         for name in batch.schema.names:
             found.setdefault(name, []).extend(batch.column(name).to_pylist())
