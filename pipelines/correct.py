@@ -243,6 +243,7 @@ def _together(
         [Individual.of_track(name, one.track) for name, one in found.items()],
         Plan.from_toml(raw.plan, "plan.toml").interactions,
         raw.frames["frame_index"].to_numpy(np.int64),
+        evidence.read_evidence(raw)[0].objects if raw.has(evidence.FILE) else None,
     )
 
 
