@@ -297,7 +297,7 @@ def _measure_animals(
             ]
             limits = next(iter(going.values())).fitted.plan.interactions
             index = writers[0].rows.frame_index
-            together = find_interactions(whole[0].seconds, tracks, limits, index)
+            together = find_interactions(whole[0].seconds, tracks, limits, index, whole[0].objects)
         return {
             name: prepared.conclude(writer, recording, notes, together).path
             for (name, prepared), writer in zip(going.items(), writers, strict=True)

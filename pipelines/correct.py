@@ -257,6 +257,7 @@ def _together(
         ],
         Plan.from_toml(raw.plan, "plan.toml").interactions,
         raw.frames["frame_index"].to_numpy(np.int64),
+        evidence.read_evidence(raw)[0].objects if raw.has(evidence.FILE) else None,
     )
 
 

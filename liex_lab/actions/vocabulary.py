@@ -275,7 +275,9 @@ class Interaction(NamedTuple):
 INTERACTIONS: dict[str, Interaction] = {
     "mount": Interaction(
         "the agent's chest lies over the target's trunk, {mount_above_mm:g} mm or more above its "
-        "mid-axis, and both head the same way within {mount_angle_rad:g} rad",
+        "mid-axis, and both head the same way within {mount_angle_rad:g} rad; where a pose is "
+        "missing, their outline lacks the area of {mount_hidden:g} animals or more, but less than "
+        "half as much volume, and in most of {before_s:g} s before the agent was behind, headed so",
         "mount",
     ),
     "huddle": Interaction(

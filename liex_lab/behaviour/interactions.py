@@ -10,10 +10,14 @@ mid-axes, as thick as the skeleton's body:
     gap = min_ij |a_i - b_j| - r_i - r_j    (mm),  a_i, b_j: points along the two mid-axes.
 
 Frames in which either animal has no trusted pose are not observed: no interaction includes them,
-and shares are of the observed time of the pair. Frames in which it is not clear which of them is
-which count for mutual words only, without a direction. Sources: Live Mouse Tracker (de Chaumont et
-al. 2019, Nature Biomedical Engineering 3:930) and deepof (Bordes et al. 2023, Nature Communications
-14:4319).
+and shares are of the observed time of the pair. Poses are interpolated over pauses up to `merge_s`.
+Frames in which it is not clear which of them is which count for mutual words only, without a
+direction. Sources: Live Mouse Tracker (de Chaumont et al. 2019, Nature Biomedical Engineering
+3:930) and deepof (Bordes et al. 2023, Nature Communications 14:4319).
+
+An animal that another one lies over has no pose, but their outline tells it from one that is merely
+hidden: its area lacks part of an animal, the volume below it does not, as the upper one is raised.
+The agent of such a mount is the animal that was behind when both were last measured.
 """
 
 from __future__ import annotations
@@ -39,7 +43,7 @@ from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.runtime.memory import blocks
 from liex_lab.tables.rows import Rows, frame_count, stop_times
 from liex_lab.tables.schema import INTERACTIONS, to_pandas
-from liex_lab.tracking.track import CORRECTED
+from liex_lab.tracking.track import CORRECTED, whole_gaps
 
 if TYPE_CHECKING:
     from liex_lab.tracking.track import Track
@@ -81,6 +85,20 @@ class Individual:
         clear = np.asarray(track.flag != "unclear")
         trusted = track.observed & (np.isin(track.flag, ["", CORRECTED]) | ~clear)
         return Individual(name, track.skeleton, track.joints_mm, trusted, clear)
+
+    def bridged(self, time_s: Array, most_s: float) -> Individual:
+        """The animal with poses interpolated where it has none for most_s or less."""
+        known = self.trusted & np.isfinite(self.joints_mm).all(axis=(1, 2))
+        flat = np.where(known[:, None], self.joints_mm.reshape(len(known), -1), np.nan)
+        joints = pd.DataFrame(flat, time_s).interpolate("index").to_numpy()
+        last = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
+        return Individual(
+            self.name,
+            self.skeleton,
+            joints.reshape(self.joints_mm.shape),
+            known | whole_gaps(time_s, known, most_s),
+            (np.ones_like(known) if self.clear is None else self.clear)[last],
+        )
 
 
 @dataclass(frozen=True)
@@ -160,6 +178,7 @@ def find_interactions(
     animals: Sequence[Individual],
     limits: InteractionThresholds | None = None,
     frame_index: NDArray[np.int64] | None = None,
+    outlines: NDArray[np.floating] | None = None,
 ) -> Interactions:
     """The interactions of the animals of one arena.
 
@@ -168,11 +187,12 @@ def find_interactions(
         animals: two or more, each with n frames.
         limits: the thresholds; None uses the defaults.
         frame_index: (n,) index of each frame in the recording; None counts from 0.
+        outlines: (n, K, 4) centre, mm, with the mean height, and area, mm^2, of what is in view;
+            NaN if absent. None if there was no depth.
     """
     limits = limits or InteractionThresholds()
-    every = np.ones(len(time_s), np.bool_)
-    clear = np.stack([every if one.clear is None else one.clear for one in animals])
-    arena = _Arena(time_s, [_Course.of(one, time_s, limits) for one in animals], clear, limits)
+    whole = [one.bridged(time_s, limits.merge_s) for one in animals]
+    arena = _Arena(time_s, whole, limits, outlines)
     found = sorted(arena.events(), key=lambda event: (event.start, event.stop, event.word))
     start, stop = np.array([(one.start, one.stop) for one in found], np.int64).reshape(-1, 2).T
     count = frame_count(np.arange(len(time_s)) if frame_index is None else frame_index)
@@ -253,8 +273,8 @@ class _Course(NamedTuple):
         length = np.linalg.norm(np.diff(spine, axis=1), axis=2).sum(axis=1)
         known = np.isfinite(length)
         scale = float(np.median(length[known])) / skeleton.length if known.any() else 1.0
-        share = np.abs(skeleton.reach[list(body.spine)] - skeleton.reach[body.front])
-        share /= skeleton.length
+        reach = skeleton.reach / skeleton.length
+        share = np.abs(reach[list(body.spine)] - reach[body.front])
         weight = np.stack([np.interp(_ALONG, share, unit) for unit in np.eye(len(share))], axis=1)
         centre = joints[:, body.trunk].mean(axis=1) * flat
         before, after = neighbours(time_s, known, limits.speed_half_window_s)
@@ -298,6 +318,7 @@ class _Toward(NamedTuple):
     nose_tail: Array  # mm, of the agent's nose from the target's tail base
     above: Array  # margin by which the agent's chest is above the target's trunk
     angle: Array  # rad, of the headings
+    behind: Mask  # whether the target is ahead of the agent, and heads as for a mount
     at_nose: Array  # rad, of the agent's head and the direction of the target's nose
     at_tail: Array  # rad, of the agent's head and the direction of the target's tail base
     closing: Array  # mm/s, of the agent towards the target
@@ -320,7 +341,8 @@ class _Toward(NamedTuple):
         way = b.centre - a.centre
         way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
         ends = [one.along[:, k] for one in (a, b) for k in (0, -1)]
-        neck = a.along[:, _NECK]
+        neck, angle = a.along[:, _NECK], _angle(a.heading, b.heading)
+        ahead = [np.einsum("nd,nd->n", one.heading, way) > 0.0 for one in (a, b)]
         return _Toward(
             gap,
             trunks,
@@ -330,7 +352,8 @@ class _Toward(NamedTuple):
             np.linalg.norm(ends[1] - ends[3], axis=1),
             np.linalg.norm(ends[0] - ends[3], axis=1),
             above,
-            _angle(a.heading, b.heading),
+            angle,
+            ahead[0] & ahead[1] & (angle <= limits.mount_angle_rad),
             _angle(ends[0] - neck, ends[2] - neck),
             _angle(ends[0] - neck, ends[3] - neck),
             np.einsum("nd,nd->n", a.velocity, way),
@@ -360,21 +383,22 @@ class _Arena:
 
     Args:
         time_s: (n,) s.
-        animals: their courses.
-        clear: (A, n) bool, whether it is clear which animal it is.
+        animals: with poses bridged.
         limits: the thresholds.
+        outlines: see `find_interactions`.
     """
 
     def __init__(
         self,
         time_s: Array,
-        animals: Sequence[_Course],
-        clear: Mask,
+        animals: Sequence[Individual],
         limits: InteractionThresholds,
+        outlines: NDArray[np.floating] | None,
     ) -> None:
-        self.time_s, self.animals, self.clear, self.limits = time_s, animals, clear, limits
+        self.time_s, self.limits, self.outlines = time_s, limits, outlines
+        self.animals = [_Course.of(one, time_s, limits) for one in animals]
         self.stop_s = stop_times(time_s)
-        self.known = np.stack([np.isfinite(one.centre[:, 0]) for one in animals])
+        self.known, self.clear = np.swapaxes([(one.trusted, one.clear) for one in animals], 0, 1)
 
     @cached_property
     def relations(self) -> dict[tuple[int, int], _Toward]:
@@ -413,6 +437,39 @@ class _Arena:
         spans = tidy(mask, free, number, self.time_s, self.stop_s, limits.merge_s, least)
         return [(a, b, float((margin[a:b] >= 0.0).mean())) for a, b in spans]
 
+    def _covered(self, i: int, j: int) -> Iterator[_Event]:
+        """The mounts of two animals that their outline shows. Single poses beside another animal
+        may be turned round: most of those in the time before decide.
+        """
+        time_s, limits, both = self.time_s, self.limits, self.observed(i, j, mutual=True)
+        free = ~both & np.delete(self.known, [i, j], axis=0).all(axis=0)
+        mask, times = self.lies_over & free, (segments(time_s, free), time_s, self.stop_s)
+        for start, stop in tidy(mask, free, *times, limits.merge_s, limits.min_s):
+            before = time_s[:start] >= time_s[start] - limits.before_s
+            rows = np.flatnonzero(both[:start] & before)
+            for way in ((i, j), (j, i)):
+                if 2 * self.relations[way].behind[rows].sum() > len(rows):
+                    directed = bool(self.clear[list(way)][:, rows].all())
+                    yield _Event(*way, "mount", start, stop, 0.0, directed)
+
+    @cached_property
+    def lies_over(self) -> Mask:
+        """Whether (n,) there are fewer outlines than animals, and they lack `mount_hidden` animals
+        in area or more, but less than half as much in the volume below them.
+
+        Usual areas and volumes are those of frames in which all animals are known and apart.
+        """
+        count, outlines = len(self.animals), np.asarray(self.outlines, float)
+        there, area = np.isfinite(outlines[..., 3]).sum(axis=1), outlines[..., 3]
+        apart = self.known.all(axis=0) & (there == count)
+        hidden, lost = (
+            count * (1.0 - total / pd.Series(total[apart]).median())
+            for total in (np.nansum(area, axis=1), np.nansum(area * outlines[..., 2], axis=1))
+        )
+        return np.asarray(
+            (there < count) & (hidden >= self.limits.mount_hidden) & (lost < 0.5 * hidden)
+        )
+
     def _of_pair(self, i: int, j: int) -> Iterator[_Event]:
         """The interactions of two animals."""
         observable = [self.observed(i, j, mutual=mutual) for mutual in (False, True)]
@@ -423,6 +480,8 @@ class _Arena:
         done = {
             word: np.zeros(len(observable[True]), np.bool_) for word in WORDS
         }  # by either animal
+        if self.outlines is not None and not self.animals[i].swims:
+            yield from self._covered(i, j)
         for word in (word for word in WORDS if word in margins[ways[0]]):
             rule = WORDS[word]
             observed, number = observable[rule.mutual], numbers[rule.mutual]
@@ -442,9 +501,9 @@ class _Arena:
                     elif word in ("approach", "leave"):
                         yield from self._crossing(way, word, start, stop, score, number)
                     else:
-                        pace = np.median(self.animals[way[0]].speed[rows])
-                        fast = word == "follow" and pace > self.limits.fast_mm_s
-                        yield _Event(*way, "chase" if fast else word, start, stop, score, True)
+                        fast = np.median(self.animals[way[0]].speed[rows]) > self.limits.fast_mm_s
+                        named = "chase" if word == "follow" and fast else word
+                        yield _Event(*way, named, start, stop, score, True)
 
     def _margins(self, i: int, j: int, number: NDArray[np.int64]) -> dict[str, Array]:
         """Margin (n,) of each rule of animal i towards j; those of mutual words are alike."""
@@ -571,8 +630,8 @@ class _Arena:
             for way in ((i, j), (j, i))
         ]
         pair = (i, j) if came[0] >= came[1] else (j, i)
-        directed = max(came) >= max(2.0 * min(came), self.limits.contact_mm)
-        directed &= bool(self.clear[[i, j], first:stop].all())
+        more = max(came) >= max(2.0 * min(came), self.limits.contact_mm)
+        directed = more and bool(self.clear[[i, j], first:stop].all())
         return _Event(*pair, word, start, stop, score, directed)
 
 
@@ -588,10 +647,12 @@ def _totals(arena: _Arena, found: Sequence[_Event], names: Sequence[str]) -> pd.
                 continue
             both = () if target < 0 else (agent, target)
             observed = arena.observed(*both, mutual=one.mutual)
-            observed_s = float(hold[observed].sum())
-            first_s = float(arena.time_s[observed][0]) if observed.any() else np.nan
             either = ((agent, target), (target, agent)) if one.mutual else ((agent, target),)
             own = [event for event in found if event.word == word and event[:2] in either]
+            for event in own:  # mounts are seen without both poses
+                observed[event.start : event.stop] = True
+            observed_s = float(hold[observed].sum())
+            first_s = float(arena.time_s[observed][0]) if observed.any() else np.nan
             total_s = float(sum(hold[event.start : event.stop].sum() for event in own))
             rows.append(
                 {

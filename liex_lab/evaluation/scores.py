@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.runtime.memory import Rows
@@ -353,8 +354,7 @@ class MeasuredIndividual:
         R_arena_camera: (3, 3) from the axes of `joints_camera` to the arena's.
         crossings: (k, 3) first frame, frame after the last, and probability of an exchange, of the
             stretches in which it may have been exchanged with another one.
-        clear: (n,) bool, False where the tables flag a pose as good, but not clearly this animal's;
-            None if there is only one.
+        interactions: the table of its arena; None if it was measured alone.
     """
 
     joints_camera: Array
@@ -363,7 +363,7 @@ class MeasuredIndividual:
     expected_mm: Array = field(default_factory=lambda: np.zeros(0))
     R_arena_camera: Array = field(default_factory=lambda: np.eye(3))
     crossings: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    clear: Mask | None = None
+    interactions: pd.DataFrame | None = None
 
 
 class Tally:

@@ -50,8 +50,8 @@ SEVERAL_PROTOCOL = (
     "recall of each action, and their mean (macro_f1) over the actions that happened. Truth is the "
     "script of the animals; of contact and isolated the distances of the rendered skins. "
     "direction: of the frames in which an action is found for the right pair, or for the same pair "
-    "the other way round, the share the right way. true: from true joints, measured: from those of "
-    "the tables, null if these have fewer than two animals."
+    "the other way round, the share the right way. true: from true joints, measured: the "
+    "tables' own, null if these have fewer than two animals."
 )
 
 

@@ -636,6 +636,11 @@ class InteractionThresholds(SettingsTable):
     mount_angle_rad: Positive = Field(
         1.05, description="... and it heads the same way within this angle"
     )
+    mount_hidden: Positive = Field(
+        0.35,
+        description="where poses are missing: the outline of both lacks this share of an animal's "
+        "area, but less than half as much volume",
+    )
     still_mm_s: Positive = Field(20.0, description="animals that huddle are slower ...")
     huddle_s: NotNegative = Field(3.0, description="... and touch for at least this time")
     moving_mm_s: Positive = Field(

@@ -193,7 +193,7 @@ def read_individuals(session: Session) -> list[MeasuredIndividual]:
                 frames["predicted_error_mm"].to_numpy(float),
                 T_arena_camera.rotation * side,
                 crossings,
-                (frames["flag"] != "unclear").to_numpy(bool),
+                session.interactions if session.has("interactions.parquet") else None,
             )
         )
     return found

@@ -8,16 +8,17 @@ were trained on or not. The sealed split uses other seeds, which appear in no de
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from liex_lab.behaviour.interactions import Individual, find_interactions
 from liex_lab.errors import LiexError
-from liex_lab.evaluation.scores import MeasuredIndividual, error_of
+from liex_lab.evaluation.scores import error_of
 from liex_lab.evaluation.several import (
     SEVERAL_PROTOCOL,
     Counts,
@@ -119,7 +120,8 @@ def _counts(
         Individual(str(k), actor.surface.skeleton, actor.joints, actor.present)
         for k, actor in enumerate(actors)
     ]
-    found = {f"true {name}": value for name, value in _deeds(true, time_s, deeds).items()}
+    exact = _deeds(find_interactions(time_s, true).events, {str(k): k for k in range(len(true))})
+    found = {f"true {name}": value for name, value in deed_counts(deeds, exact, n).items()}
     touching = np.asarray(np.nan_to_num(gaps, nan=np.inf) <= _CONTACT_MM)
     found["contact_s"] = float(touching.sum()) / 2.0 * float(np.median(np.diff(time_s)))
     if not measure:
@@ -145,42 +147,22 @@ def _counts(
     crossings = np.concatenate([np.zeros((0, 3)), *(one.crossings for one in individuals)])
     found |= crossing_counts(distance, np.unique(crossings, axis=0))
     found |= pose_counts(distance, np.asarray(touching.any(axis=2)), trusted, resting, _CAP_MM)
-    if len(individuals) > 1:
-        own = _deeds(_named(individuals, distance, recording), time_s, deeds)
+    if individuals and (events := individuals[0].interactions) is not None:
+        # of each individual the true animal that it is nearest to in most frames
+        cost = np.nan_to_num(np.minimum(distance, _CAP_MM), nan=_CAP_MM).mean(axis=0)
+        numbers = {f"animal{k}": int(one) for k, one in enumerate(cost.argmin(axis=0), 1)}
+        own = deed_counts(deeds, _deeds(events, numbers), n)
         found |= {f"measured {name}": value for name, value in own.items()}
     return found, messages
 
 
-def _named(
-    individuals: Sequence[MeasuredIndividual], distance: Array, recording: RenderedRecording
-) -> list[Individual]:
-    """The individuals under the number of the true animal that each is nearest to in most frames,
-    in the order of these; up to a shift in the arena frame.
-    """
-    cost = np.nan_to_num(np.minimum(distance, _CAP_MM), nan=_CAP_MM).mean(axis=0)
-    taken = cost.argmin(axis=0)
+def _deeds(events: pd.DataFrame, numbers: Mapping[str, int]) -> list[Deed]:
+    """The interactions of a table, by the numbers of the animals."""
+    names = ["agent", "target", "action", "start_frame", "stop_frame"]
     return [
-        Individual(
-            str(taken[k]),
-            recording.skeleton,
-            one.joints_camera @ one.R_arena_camera.T,
-            one.trusted if one.clear is None else one.trusted | ~one.clear,
-            one.clear,
-        )
-        for k, one in enumerate(individuals)
+        (numbers[agent], numbers[target] if target else -1, *rest)
+        for agent, target, *rest in events[names].itertuples(index=False, name=None)
     ]
-
-
-def _deeds(animals: Sequence[Individual], time_s: Array, truth: Sequence[Deed]) -> Counts:
-    """Counts of the interactions that are found."""
-    events = find_interactions(time_s, animals).events
-    found = [
-        (int(agent), int(target or -1), word, start, stop)
-        for agent, target, word, start, stop in events[
-            ["agent", "target", "action", "start_frame", "stop_frame"]
-        ].itertuples(index=False, name=None)
-    ]
-    return deed_counts(truth, found, len(time_s))
 
 
 def skin_gaps(recording: RenderedRecording) -> Array:

@@ -147,6 +147,70 @@ def test_frames_that_are_not_trusted_are_not_observed():
     assert alone.totals["share"].isna().all()
 
 
+@pytest.mark.parametrize(("lost", "frames"), [(1, 180), (8, 180), (12, 168)])
+def test_short_pauses_of_a_measurement_are_bridged(lost, frames):
+    a, b = mouse("a", still(0.0, 0.0)), mouse("b", still(0.0, 32.0))
+    trusted = np.ones(180, np.bool_)
+    trusted[100 : 100 + lost] = False
+    joints = np.where(trusted[:, None, None], b.joints_mm, 500.0)  # wrong where not trusted
+    b = replace(b, trusted=trusted, joints_mm=joints)
+    contact = events(a, b).query("action == 'contact'")
+    assert (contact["stop_frame"] - contact["start_frame"]).sum() == frames
+    # bridged frames are no clearer than the one before
+    late = find_interactions(np.arange(180) / HZ, [a, replace(b, clear=np.arange(180) >= 100)])
+    own = late.totals.query("action == 'nose_to_side'")
+    assert own["observed_s"].to_numpy() == pytest.approx((80 - lost) / HZ)
+
+
+def covered_pair(turned: float = 0.0, **of_b: np.ndarray) -> tuple[list[Individual], np.ndarray]:
+    """Two mice, a behind b, and their outlines: in frames 90 to 150 b has no pose, and one outline
+    shows 1.3 mice whose volume is that of 1.95.
+    """
+    a, b = mouse("a", still(0.0, 0.0)), mouse("b", still(100.0, 0.0, turned))
+    covered = slice(90, 150)
+    outlines = np.full((180, 4, 4), np.nan)
+    outlines[:, :2] = [[32.0, 0.0, 20.0, 1500.0], [132.0, 0.0, 20.0, 1500.0]]
+    outlines[covered, 0, 2:] = 30.0, 1.3 * 1500.0
+    outlines[covered, 1] = np.nan
+    trusted = np.ones(180, np.bool_)
+    trusted[covered] = False
+    return [a, replace(b, trusted=trusted, **of_b)], outlines
+
+
+def mounts(animals: list[Individual], outlines: np.ndarray | None) -> pd.DataFrame:
+    found = find_interactions(np.arange(180) / HZ, animals, outlines=outlines)
+    return found.events.query("action == 'mount'")
+
+
+def test_a_mount_is_seen_by_the_outline_of_a_covered_animal():
+    animals, outlines = covered_pair()
+    found = mounts(animals, outlines)
+    assert said(found) == [("a", "b", "mount")]
+    assert found[["start_frame", "stop_frame", "score"]].to_numpy().tolist() == [[90, 150, 0.0]]
+    assert found["directed"].all()
+    totals = find_interactions(np.arange(180) / HZ, animals, outlines=outlines).totals
+    own = totals.query("action == 'mount'").set_index("agent")
+    assert own["share"].to_dict() == pytest.approx({"a": 2.0 / 6.0, "b": 0.0})
+    flipped = animals[0].joints_mm.copy()
+    flipped[84:90] = flipped[84:90, ::-1]  # the last poses are turned round
+    again = mounts([replace(animals[0], joints_mm=flipped), animals[1]], outlines)
+    assert said(again) == [("a", "b", "mount")]
+    unclear, _ = covered_pair(clear=np.arange(180) < 80)
+    assert not mounts(unclear, outlines)["directed"].any()
+
+
+def test_an_animal_that_is_hidden_beside_or_faces_the_other_is_not_mounted():
+    animals, outlines = covered_pair()
+    assert mounts(animals, None).empty
+    low = outlines.copy()
+    low[90:150, 0, 2] = 20.0  # as one that an edge hides
+    assert mounts(animals, low).empty
+    wide = outlines.copy()
+    wide[90:150, 0, 3] = 1.8 * 1500.0
+    assert mounts(animals, wide).empty
+    assert mounts(covered_pair(np.pi)[0], outlines).empty
+
+
 def test_distances_of_skins_agree_with_those_of_the_meshes():
     surface = Surface.of(MOUSE)
     scale = SPINE / MOUSE.length

@@ -5,6 +5,7 @@ import pytest
 from liex_lab.pipelines.evaluation import several
 from liex_lab.pipelines.evaluation.several import evaluate_several
 
+from liex_lab.behaviour.interactions import Individual, find_interactions
 from liex_lab.errors import LiexError
 from liex_lab.evaluation.scores import MeasuredIndividual
 from liex_lab.simulation.scenes.catalogue import SEALED_FROM
@@ -19,11 +20,13 @@ def test_two_animals_near_the_truth_score_high_and_an_exchange_is_a_swap(monkeyp
         if exchange[0]:
             joints[0][150:], joints[1][150:] = joints[1][150:], joints[0][150:].copy()
         trusted = np.ones(len(recording), np.bool_)
-        return (
-            [MeasuredIndividual(one, trusted, R_arena_camera=T.rotation) for one in joints],
-            [],
-            0,
-        )
+        animals = [
+            Individual(f"animal{k}", recording.skeleton, T @ one, trusted)
+            for k, one in enumerate(joints, 1)
+        ]
+        found = find_interactions((recording.times_ns - recording.times_ns[0]) * 1e-9, animals)
+        own = [MeasuredIndividual(one, trusted, interactions=found.events) for one in joints]
+        return own, [], 0
 
     monkeypatch.setattr(several, "run_product", pretend)
     row = evaluate_several(n_frames=300, n_recordings=1)["rows"]["all"]
