@@ -351,16 +351,17 @@ def _sizes(observed: Observations, bodies: Array, path: Slots, states: Slots) ->
     weight = np.minimum(step_s / _INDEPENDENT_S, 1.0)
     usual, total = np.zeros(n_animals), 1e-9
     shared = (_STRETCH_SD / _SIZE_SD) ** 2
-    for start, stop in spans(apart):
+    for start, stop in (*spans(apart), *spans(~apart)):
         rows = slice(start, stop)
         n = float(weight[rows].sum())
         weight[rows] /= 1.0 + n * shared
-        usual += n / (1.0 + n * shared) * np.sort(own[rows].mean(axis=0))[::-1]
-        total += n / (1.0 + n * shared)
+        if apart[start]:
+            usual += n / (1.0 + n * shared) * np.sort(own[rows].mean(axis=0))[::-1]
+            total += n / (1.0 + n * shared)
     if (bodies != bodies[0]).any():
         off = bodies[np.arange(n_animals), :, states].sum(axis=1).T
         off = off - off.min(axis=1, keepdims=True)
-        return np.asarray((weight * apart)[:, None] * np.minimum(off, _MOST_NATS))
+        return np.asarray(weight[:, None] * np.minimum(off, _MOST_NATS))
     usual /= total
     usual *= np.sqrt(max(0.0, 1.0 - 0.5 * _STRETCH_SD**2 / max(float(usual.var()), 1e-9)))
     off = ((size[:, states] - usual) / _SIZE_SD) ** 2
@@ -449,7 +450,7 @@ def _follow(
     """Assign the components of frames that do not show all animals, in place, frame by frame from
     the nearest frame that does.
 
-    A component belongs to the animal of the least cost (d / s)^2 + 2 log s + 4 log r, d: its
+    A component belongs to the animal of the least cost (d / s)^2 + 2 log s + 2 log r, d: its
     distance from where that was last in view, s: a standard deviation that grows with the time
     since, r: the distance of that animal's body from the depth.
 
@@ -469,7 +470,7 @@ def _follow(
                 there = np.flatnonzero(known[t])
                 sd = length_mm * (_PLACE_SHARE + np.abs(seconds[t] - last_s))[:, None]
                 off = np.linalg.norm(last[:, None] - places[t, there], axis=-1)
-                cost = (off / sd) ** 2 + 2.0 * np.log(sd) + 4.0 * misfit[t][:, there]
+                cost = (off / sd) ** 2 + 2.0 * np.log(sd) + 2.0 * misfit[t][:, there]
                 for _ in there:
                     animal, one = np.unravel_index(np.argmin(cost), cost.shape)
                     way[t - start, animal] = there[one]

@@ -221,8 +221,10 @@ class JointTracker:
         area = np.where(crops.found, crops.blobs.area_mm2, 0.0)
         right = area >= self._least_mm2
         if self.scene.view.frame == VIEWS[0]:  # swimming animals are at any height
-            height = crops.blobs.volume_mm3 / np.maximum(area, 1e-9) / self.heights_mm[0]
-            right &= (height > ANIMAL_HEIGHTS[0]) & (height < ANIMAL_HEIGHTS[1])
+            height = crops.blobs.volume_mm3 / np.maximum(area, 1e-9)
+            least, most = ANIMAL_HEIGHTS
+            right &= height > least * min(self.heights_mm)
+            right &= height < (most + 1.0) * max(self.heights_mm)  # on top of another one
         return np.asarray(right)
 
     def _beside(self, crops: HeightMaps, depths: NDArray[np.float32]) -> HeightMaps:

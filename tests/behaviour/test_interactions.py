@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -162,7 +163,7 @@ def test_short_pauses_of_a_measurement_are_bridged(lost, frames):
     assert own["observed_s"].to_numpy() == pytest.approx((80 - lost) / HZ)
 
 
-def covered_pair(turned: float = 0.0, **of_b: np.ndarray) -> tuple[list[Individual], np.ndarray]:
+def covered_pair(turned: float = 0.0, **of_b: Any) -> tuple[list[Individual], np.ndarray]:
     """Two mice, a behind b, and their outlines: in frames 90 to 150 b has no pose, and one outline
     shows 1.3 mice whose volume is that of 1.95.
     """

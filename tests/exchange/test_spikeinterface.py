@@ -1,6 +1,7 @@
 """SpikeInterface opens a recording to which the manual adds our measures; where it is installed."""
 
 import shutil
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -19,7 +20,7 @@ def test_ephys_and_ours_are_on_one_clock(session, tmp_path, monkeypatch):
     pd.DataFrame({"time_s": ours}).to_csv("camera.csv", index=False)
     pd.DataFrame({"time_s": 1.00002 * ours + 9}).to_csv("ephys.csv", index=False)
     sync_session("mouse_walk.liex", "ephys.csv", pulses="camera.csv", report=False)
-    names: dict[str, object] = {}
+    names: dict[str, Any] = {}
     for language, block in BLOCK.findall(PAGES["docs/howto/sync.md"]):
         if language == "python":
             exec(block, names)
