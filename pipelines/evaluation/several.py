@@ -43,8 +43,8 @@ from .scenes import run_product
 
 Array = NDArray[np.float64]
 
-SEEDS: Final = tuple(range(2001, 2013))
-SEALED_SEEDS: Final = tuple(range(958_204_401, 958_204_413))
+SEEDS: Final = tuple(range(2001, 2049))
+SEALED_SEEDS: Final = tuple(range(958_311_701, 958_311_749))
 _SENSORS = (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, *unseen((KINECT_V2_SENSOR,)))
 _CONTACT_MM, _ALONE_MM, _ALONE_S = 10.0, 100.0, 1.0  # of `contact` and `isolated`, as printed
 _CAP_MM = 65.0  # of a joint error, about a body length
@@ -64,7 +64,7 @@ def evaluate_several(
     Args:
         animals: in each recording, 2 to 4.
         n_frames: length of each recording.
-        n_recordings: of different seeds, 1 to 12.
+        n_recordings: of different seeds, 1 to 48.
         sealed: use the sealed seeds, which are not for development.
         measure: False only scores the interactions of true joints.
         progress: called recording by recording.

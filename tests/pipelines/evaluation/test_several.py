@@ -62,5 +62,5 @@ def test_seeds_are_apart_and_wrong_numbers_are_refused():
         evaluate_several(n_frames=60, n_recordings=1, measure=False)["rows"]["all"]["contact_s"]
         >= 0
     )
-    with pytest.raises(LiexError, match="1 to 12 recordings of 2 to 4 animals, got 1 of 5"):
+    with pytest.raises(LiexError, match="1 to 48 recordings of 2 to 4 animals, got 1 of 5"):
         evaluate_several(5, n_recordings=1)
