@@ -5,6 +5,7 @@ dead does not hold up the measurement.
 """
 
 import json
+import os
 import socket
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -104,8 +105,13 @@ def _lsl(address: str) -> Sender:
 def _serial(address: str) -> Sender:
     import serial
 
-    port = serial.Serial(urlsplit(address).path, _BAUD, write_timeout=0)
-    return Sender(lambda line: port.write(line.encode()), port.close)
+    port = serial.Serial(urlsplit(address).path, _BAUD)
+
+    def send(line: str) -> None:  # pyserial waits, for ever, once the buffer of the line is full
+        if os.write(port.fileno(), line.encode()) < len(line.encode()):
+            raise BlockingIOError("nobody reads the line")
+
+    return Sender(send, port.close)
 
 
 def _host_port(address: str) -> tuple[str, int]:

@@ -4,7 +4,10 @@ import builtins
 import json
 import os
 import socket
+import subprocess
+import sys
 import tty
+from contextlib import suppress
 from typing import Any
 
 import pylsl
@@ -64,6 +67,42 @@ def test_a_serial_line_gets_the_message() -> None:
     os.close(there)
     with pytest.raises(LiexError, match=r"nothing can be sent to serial:///dev/none"):
         open_sender("serial:///dev/none")
+
+
+def test_a_serial_line_that_nobody_reads_holds_up_nothing() -> None:
+    here, there = os.openpty()
+    tty.setraw(there)
+    sender = open_sender(f"serial://{os.ttyname(there)}")
+    with suppress(BlockingIOError):
+        for _ in range(2000):
+            sender.send(LINE)
+        pytest.fail("the line takes whatever is sent")
+    sender.close()
+    os.close(here)
+    os.close(there)
+
+
+INLET = """
+import pylsl
+found = pylsl.resolve_byprop("name", "rears of a test", 1, 5.0)
+inlet = pylsl.StreamInlet(found[0]) if found else None
+print(inlet and (inlet.open_stream(5.0) or found[0].type()), flush=True)
+print(inlet and inlet.pull_sample(timeout=5.0)[0][0], flush=True)
+"""
+
+
+def test_another_process_gets_a_message_by_lsl() -> None:
+    sender = open_sender("lsl://rears of a test")
+    command = [sys.executable, "-c", INLET]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        kind = other.stdout.readline().strip()
+        sender.send(LINE)
+        received = other.stdout.readline()
+    sender.close()
+    if kind == "None":
+        pytest.skip("LSL finds no stream on this machine: its network carries no multicast")
+    assert (kind, received) == ("Markers", LINE)
 
 
 def test_lsl_announces_a_stream(monkeypatch: pytest.MonkeyPatch) -> None:
