@@ -60,7 +60,8 @@ def compare_groups(
     Args:
         places: study files, session folders, or folders that contain sessions at any depth.
         out: output folder; created if needed.
-        measures: columns of the summary; () uses the default ones and every action's share.
+        measures: columns of the summary or of the rhythm; () uses the default ones, and the shares
+            of every action and zone.
         reference: compare with this group only; None compares all pairs.
         animals: a CSV with `subject_id` and any of group, cage, sex, batch; it overrides the
             sessions' own facts.

@@ -58,6 +58,23 @@ _USUAL = (
     "outer_half_share",
     "top_third_share",
     "tail_beat_hz",
+    "dark_minus_light_mm_per_h",
+    "relative_amplitude",
+    "interdaily_stability",
+    "intradaily_variability",
+)
+_OF_DAYS = (  # of the table `rhythm`; hours of the clock are circular, and cannot be averaged
+    "light_mm_per_h",
+    "dark_mm_per_h",
+    "dark_minus_light_mm_per_h",
+    "light_sleep_by_immobility_share",
+    "dark_sleep_by_immobility_share",
+    "m10_mm_per_h",
+    "l5_mm_per_h",
+    "relative_amplitude",
+    "interdaily_stability",
+    "intradaily_variability",
+    "period_h",
 )
 
 STATS = table_columns("stats")
@@ -71,16 +88,27 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
 
     Returns:
         Columns of the tables `sessions` and `summary`, and n_bouts; a column of both tables has the
-            suffix `_summary` for the second. Animals of one arena also have its name, `arena`,
+            suffix `_summary` for the second. Sessions of plans that state the light have measures
+            of their rhythm. Animals of one arena also have its name, `arena`,
             whether they may have been exchanged, `exchanged`, and its `arena_measures`.
     """
     rows = [
         session.table("sessions")
         .merge(session.summary, on=["session_id", "individual"], suffixes=("", "_summary"))
-        .assign(n_bouts=len(session.table("bouts", ["action"])), **_together(session))
+        .assign(n_bouts=len(session.table("bouts", ["action"])), **_of_days(session))
+        .assign(**_together(session))
         for session in sessions
     ]
     return pd.concat(rows or [pd.DataFrame(columns=["session_id", *SUBJECT])], ignore_index=True)
+
+
+def _of_days(session: SessionTables) -> dict[str, float]:
+    """The measures of a session's rhythm; nothing without the table."""
+    if "rhythm.parquet" not in session.metadata.get("files", {}):
+        return {}
+    return {
+        name: float(value) for name, value in session.table("rhythm")[[*_OF_DAYS]].iloc[0].items()
+    }
 
 
 def _together(session: SessionTables) -> dict[str, Any]:
@@ -102,8 +130,8 @@ def _together(session: SessionTables) -> dict[str, Any]:
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
-    """The default measures: the usual ones with values, every action's share, and how often the
-    animals of an arena interact.
+    """The default measures: the usual ones with values, the share of every action and zone, and
+    how often the animals of an arena interact.
 
     Args:
         table: one row per session, see `collect`.
@@ -114,8 +142,8 @@ def usual_measures(table: pd.DataFrame) -> list[str]:
     shares = [
         str(name)
         for name in table.columns
-        if str(name).removesuffix("_share") + "_count" in table.columns
-        and str(name).endswith("_share")
+        if str(name).endswith("_share")
+        and (str(name).removesuffix("_share") + "_count" in table or str(name).startswith("zone_"))
     ]
     pairs = [
         str(name)

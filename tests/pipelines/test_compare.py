@@ -18,11 +18,12 @@ from liex_lab.errors import SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.folder import write_failure
 from liex_lab.sessions.verdict import OTHER_ANIMAL
-from liex_lab.tables.schema import CROSSINGS
+from liex_lab.tables.schema import CROSSINGS, from_pandas, table_columns, write_table
 from tests.sessions.pair import write_pair
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
 compare = partial(compare_groups, figures=False)
+RHYTHM = table_columns("rhythm")
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +63,29 @@ def test_the_usual_measures_are_those_with_values(study, tmp_path):
     assert {"distance_m", "mean_speed_mm_s", "walk_share"} <= set(stats["measure"])
     assert "outer_half_share" not in set(stats["measure"])  # nobody knows where the walls are
     assert "unlabelled_share" not in set(stats["measure"])
+
+
+def test_rhythms_and_zones_are_compared_as_the_summary_is(study, tmp_path):
+    copied = shutil.copytree(study, tmp_path / "study")
+    for k, folder in enumerate(sorted(copied.glob("*/*.liex"))):
+        hours = pd.DataFrame({"session_id": [f"s{k}"], "individual": "animal_1"})
+        values = {"interdaily_stability": 0.5 + 0.01 * k, "m10_onset_h": 23.0}
+        rhythm = hours.reindex(columns=[one.name for one in RHYTHM]).assign(**values)
+        rhythm["not_measured"] = ""
+        write_table(folder / "rhythm.parquet", RHYTHM, from_pandas(rhythm), {})
+        facts = json.loads((folder / "session.json").read_text(encoding="utf-8"))["files"]
+        edit_json(folder, files=facts | {"rhythm.parquet": {"bytes": 1}})
+        summary = pd.read_csv(folder / "summary.csv").assign(zone_nest_share=0.1 * (k >= 5))
+        summary.to_csv(folder / "summary.csv", index=False)
+    stats = compare([copied], tmp_path / "out")["stats"].set_index("measure")
+    assert stats.loc["interdaily_stability", "estimate"] == pytest.approx(0.05)
+    assert stats.loc["interdaily_stability", "p"] == pytest.approx(2 / 252)
+    assert stats.loc["zone_nest_share", "estimate"] == pytest.approx(0.1)
+    assert "relative_amplitude" not in stats.index  # without a value
+    asked = compare([copied], tmp_path / "asked", ["period_h"])["stats"]
+    assert asked["refused"].str.len().all()
+    with pytest.raises(SessionError, match="m10_onset_h"):  # of the clock: no mean of 23 h and 1 h
+        compare([copied], tmp_path / "onset", ["m10_onset_h"])
 
 
 def test_a_list_of_the_animals_overrules_the_sessions(study, tmp_path):
