@@ -48,6 +48,7 @@ SKIPPED = {
     r"^liex evaluate actions --tracks": "needs real mice with people's words",
     r"ANIMAL1|^liex correct crossing ": "needs two animals; sessions/test_identities.py does it",
     r"movement\.kinematics": "another program, which .ci/peers runs",
+    r"\"poses_2d\.": "needs PyTables, as DeepLabCut does; exchange/test_peers.py does it",
     r"spikeinterface|recording\.time_to": "another program, which .ci/peers runs",
     r"^liex (?:train|evaluate pose --animal) snake\.toml|--plan plan\.toml": (
         "trains for minutes; training/test_own_animal.py does it"

@@ -1,5 +1,7 @@
 """movement's and SLEAP's own readers open what we write; collected where both are installed."""
 
+from pathlib import Path
+
 import numpy as np
 import sleap_io
 import xarray
@@ -8,6 +10,7 @@ from movement.validators.datasets import ValidPosesInputs
 
 from liex_lab.exchange import export
 from tests.sessions.pair import NAMES, write_pair
+from tests.test_pages import BLOCK, PAGES
 
 
 def test_movement_takes_the_netcdf_for_its_own(session, tmp_path):
@@ -58,19 +61,21 @@ def test_movement_and_sleap_io_read_derived_points(session, tmp_path):
     assert [node.name for node in labels.skeletons[0].nodes] == list(data["keypoints"].values)
 
 
-def test_movement_and_sleap_io_read_the_animals_of_an_arena_as_individuals(tmp_path):
+def test_movement_and_sleap_io_read_the_animals_of_an_arena_as_individuals(tmp_path, monkeypatch):
     pair = write_pair(tmp_path)
     ValidPosesInputs.validate(
         xarray.load_dataset(export(pair, "movement", tmp_path), engine="h5netcdf")
     )
-    dlc = load_poses.from_dlc_file(export(pair, "dlc", tmp_path) / "poses_2d.csv")
+    monkeypatch.chdir(export(pair, "dlc", tmp_path))
+    exec(dict(BLOCK.findall(PAGES["docs/howto/deeplabcut.md"]))["python"], {})  # to .h5
+    dlc = [load_poses.from_dlc_file(Path(f"poses_2d.{kind}")) for kind in ("csv", "h5")]
     path = export(pair, "sleap", tmp_path)
     sleap, labels = load_poses.from_sleap_file(path), sleap_io.load_file(str(path))
     assert [track.name for track in labels.tracks] == list(NAMES)
     for k, session in enumerate(pair):
         uv_px = session.pose_arrays().uv_px
         np.testing.assert_allclose(labels.numpy()[:, k], uv_px, rtol=1e-6)
-        for data in (dlc, sleap):
+        for data in (*dlc, sleap):
             own = data["position"].sel(individuals=NAMES[k])
             np.testing.assert_allclose(
                 own.transpose("time", "keypoints", "space"), uv_px, rtol=1e-6
