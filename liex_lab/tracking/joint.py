@@ -310,11 +310,13 @@ class JointTracker:
         """Labels (q, P, S, S) of the parts in P ways of cutting, and the body (q, P, m) of each."""
         areas = np.array([tracker.scene.area_mm2 for tracker in self.trackers])
         bodies = np.array([self._bodies.index(tracker) for tracker in self.trackers])
-        # of animals of two sizes either may be on either side
+        # of animals of two sizes either may be on either side: on a floor, volumes decide
         chosen = np.arange(len(areas)) if len(areas) == m else np.arange(m)
-        n_ways = _N_DIRECTIONS * (1 if len(self._bodies) == 1 else 2)
-        angles = np.arange(n_ways) * np.pi / _N_DIRECTIONS
+        n_sides = 1 if len(self._bodies) == 1 else 2
+        n_ways = _N_DIRECTIONS * (n_sides if self._camera_view else 1)
+        angles = np.arange(_N_DIRECTIONS * n_sides) * np.pi / _N_DIRECTIONS
         share = np.cumsum(areas[chosen]) / areas[chosen].sum()
+        volumes = (areas * self.heights_mm)[chosen]
         v, u = np.mgrid[: blobs.heights.shape[1], : blobs.heights.shape[2]]
         labels = np.full((len(blobs.n_px), n_ways, *u.shape), -1, np.int8)
         for own, heights in zip(labels, blobs.heights, strict=True):
@@ -323,7 +325,12 @@ class JointTracker:
             axes = np.linalg.eigh(np.cov(pixels))[1]  # across and along
             along = (axes @ (np.cos(angles), np.sin(angles))).T @ pixels
             cuts = np.quantile(along, share[:-1], axis=1)
-            own[:, inside] = (along > cuts[..., None]).sum(axis=0)
+            parts = (along > cuts[..., None]).sum(axis=0)
+            if len(parts) > n_ways:
+                of_first = (parts == 0) @ heights[inside].astype(float) / heights[inside].sum()
+                off = np.abs(of_first - volumes[0] / volumes.sum()).reshape(n_sides, n_ways)
+                parts = parts.reshape(n_sides, n_ways, -1)[off.argmin(axis=0), np.arange(n_ways)]
+            own[:, inside] = parts
         return labels, np.tile(bodies[chosen], (len(labels), n_ways, 1))
 
     def _cut(
