@@ -106,9 +106,8 @@ def _of_days(session: SessionTables) -> dict[str, float]:
     """The measures of a session's rhythm; nothing without the table."""
     if "rhythm.parquet" not in session.metadata.get("files", {}):
         return {}
-    return {
-        name: float(value) for name, value in session.table("rhythm")[[*_OF_DAYS]].iloc[0].items()
-    }
+    row = session.table("rhythm").iloc[0]
+    return {name: float(row[name]) for name in _OF_DAYS}
 
 
 def _together(session: SessionTables) -> dict[str, Any]:
