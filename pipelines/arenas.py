@@ -42,6 +42,7 @@ from .compiling import compile_ahead
 from .session import (
     HEAVY,
     MEASURING,
+    Further,
     Prepared,
     check_unused,
     observed,
@@ -78,6 +79,7 @@ def run_arenas(
     pool: processes.WorkerPool | None = None,
     report: bool = True,
     animals: Sequence[tuple[Path, sections.SessionFacts]] = (),
+    further: Further | None = None,
     progress: Progress = silent,
 ) -> list[ArenaOutcome]:
     """Measure several arenas in one image, or several animals in one arena, a session each.
@@ -96,6 +98,7 @@ def run_arenas(
         report: whether to write each session's report with its figures.
         animals: folder and facts of each of several animals in one arena, the largest first, if
             they are known; () names them animal1 and so on.
+        further: measures to add to those of several animals in one arena.
         progress: receives progress reports.
 
     Returns:
@@ -107,7 +110,17 @@ def run_arenas(
     first = plan or Plan.load(USUAL).with_settings(settings)
     if first.arenas is None:
         return _run_animals(
-            recording, plan, first, Path(out), settings, overwrite, notes, report, animals, progress
+            recording,
+            plan,
+            first,
+            Path(out),
+            settings,
+            overwrite,
+            notes,
+            report,
+            animals,
+            further,
+            progress,
         )
     pool = pool or processes.processes_for(workers or 1)
     outcomes: dict[str, ArenaOutcome] = {}
@@ -199,6 +212,7 @@ def _run_animals(
     notes: Mapping[str, Any] | None,
     report: bool,
     named: Sequence[tuple[Path, sections.SessionFacts]],
+    further: Further | None,
     progress: Progress,
 ) -> list[ArenaOutcome]:
     """Measure the animals of one arena, see `run_arenas`; `first` is the plan with its settings."""
@@ -240,7 +254,7 @@ def _run_animals(
                 own = replace(fitted, plan=plan, tracker=tracker)
                 going[facts.individual] = prepare(own, folder, started, progress)
             sessions = _measure_animals(
-                going, joint, readings, recording, overwrite, notes, report, progress
+                going, joint, readings, recording, overwrite, notes, report, further, progress
             )
             return [ArenaOutcome(name, session) for name, session in sessions.items()]
     alone = ["animal.rfid=", "animal.count=1"]
@@ -252,6 +266,7 @@ def _run_animals(
         overwrite=overwrite,
         notes=notes,
         report=report,
+        further=further,
         progress=progress,
     )
     return [ArenaOutcome("animal1", session)]
@@ -265,6 +280,7 @@ def _measure_animals(
     overwrite: bool,
     notes: Mapping[str, Any] | None,
     report: bool,
+    further: Further | None,
     progress: Progress,
 ) -> dict[str, Path]:
     """Measure all frames for all animals, decide their identities, and finish the sessions."""
@@ -299,7 +315,7 @@ def _measure_animals(
             index = writers[0].rows.frame_index
             together = find_interactions(whole[0].seconds, tracks, limits, index, whole[0].objects)
         return {
-            name: prepared.conclude(writer, recording, notes, together).path
+            name: prepared.conclude(writer, recording, notes, together, further).path
             for (name, prepared), writer in zip(going.items(), writers, strict=True)
         }
 

@@ -540,7 +540,7 @@ class Prepared:
         writer: SessionWriter,
         source: str | Path | Recording,
         notes: Mapping[str, Any] | None = None,
-        further: Further | None = None,
+        *further: Further | None,
     ) -> Session:
         """Make behaviour and tables of a track, and move the session to its folder.
 
@@ -548,12 +548,12 @@ class Prepared:
             writer: has the track.
             source: as for `finish`.
             notes: additional contents of session.json.
-            further: measures to add, such as the interactions of all animals of the arena.
+            *further: measures to add, such as the interactions of all animals of the arena.
         """
         if isinstance(source, str | Path):
             writer.note(input=evidence.link_to(source, self.folder))
         writer.note(**dict(notes or {}))
-        return conclude(writer, self.fitted.plan, self.timings, further)
+        return conclude(writer, self.fitted.plan, self.timings, *further)
 
 
 def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) -> Prepared:
@@ -660,7 +660,7 @@ def conclude(
     writer: SessionWriter,
     plan: Plan,
     timings: dict[str, float],
-    further: Further | None = None,
+    *further: Further | None,
 ) -> Session:
     """Measure the behaviour and move the session to its folder; returns the finished session.
 
@@ -668,7 +668,7 @@ def conclude(
         writer: has all frames and their track.
         plan: rules and action model.
         timings: seconds of each part of the work so far.
-        further: measures to add, such as the interactions of all animals of the arena.
+        *further: measures to add, such as the interactions of all animals of the arena.
     """
     behaviour, notes = measure_behaviour(writer.rows, plan, writer.origin, writer.allocate)
     writer.note(**notes, problems=_refused_sentence(notes))
@@ -679,12 +679,12 @@ def conclude(
         known |= dict(writer.rows.frames_table[["session_id", "individual", "frame_index"]])
         closing["results"]["moseq"] = to_pandas(MOSEQ, known)
         closing["columns"] += MOSEQ
-    if further is not None:
-        more = further.for_session(writer.rows, behaviour.tables)
+    for one in filter(None, further):
+        more = one.for_session(writer.rows, behaviour.tables)
         closing["results"] |= more["results"]
         closing["columns"] += more["columns"]
         closing["record"] |= more["record"]
-        closing["together"] = more.get("together")
+        closing["together"] = more.get("together", closing.get("together"))
     return writer.close(timings_s=timings, **closing)
 
 

@@ -6,7 +6,8 @@ have in it.
 """
 
 import time
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TextIO
@@ -72,13 +73,30 @@ class Triggers:
     probability: float = 1.0
 
 
+@dataclass
+class _Watched:
+    """What is known of one animal so far.
+
+    Attributes:
+        name: of the animal.
+        window: its latest rows.
+        onsets: finds the events, rule by rule.
+        acting: whether each action is under way.
+    """
+
+    name: str
+    window: Track
+    onsets: list[Onsets]
+    acting: dict[str, bool]
+
+
 class TriggerWatch:
     """Applies rules to every frame of a live recording; sends and logs their events.
 
     Attributes:
         events: all so far, in order: the facts of a message and of the table `triggers`.
-        accounts: of each rule, what became of its events and, once there is a session, their
-            agreement with its own.
+        accounts: of each rule and animal, what became of its events and, once there is a session,
+            their agreement with its own.
         problems: receivers that failed, and why.
 
     Args:
@@ -90,7 +108,7 @@ class TriggerWatch:
     """
 
     def __init__(self, stated: Triggers, plan: Plan) -> None:
-        skeleton = Skeleton.load(plan.animal.skeleton)
+        self._skeleton = skeleton = Skeleton.load(plan.animal.skeleton)
         self._recogniser = build_recogniser(plan, skeleton)
         self._thresholds = build_rules(plan)
         words: tuple[str, ...] = ()
@@ -102,16 +120,15 @@ class TriggerWatch:
         self._rules = [Rule.of_text(text, known) for text in dict.fromkeys(stated.rules)]
         self._names = {name for rule in self._rules for name in rule.names}
         self._acts = {name: words_in(name, words) for name in self._names & {*words, "rear"}}
-        self._acting = dict.fromkeys(self._acts, False)
         moving = {one.name for kind in KINDS for one in table_columns("kinematics", kind)}
         self._moves = bool(self._names & moving)
         self._stated, self._plan = stated, plan
-        self._onsets = [self._new_onsets(rule) for rule in self._rules]
-        self._n_events = [0] * len(self._rules)
+        self._n_events = Counter[tuple[int, str]]()
+        self._animals: list[_Watched] = []
+        self._places: list[Array] = []  # (N, 2) px of all animals at each event
         self._senders = {address: open_sender(address) for address in stated.addresses}
         self._rng = np.random.default_rng(plan.seed)
         self._log: TextIO | None = None
-        self._window: Track | None = None
         self._first_ns = 0
         self._arena: Arena = UNKNOWN
         self._zones: tuple[Zone, ...] = ()
@@ -119,9 +136,27 @@ class TriggerWatch:
         self.accounts: list[dict[str, Any]] = []
         self.problems: dict[str, str] = {}
 
-    def begin(self, tracker: FrameTracker) -> None:
-        """Start with a recording whose scene is learned: find its arena and zones."""
+    def begin(self, tracker: FrameTracker, individuals: Sequence[str]) -> None:
+        """Start with a recording whose scene is learned: find its arena and zones.
+
+        Args:
+            tracker: of one of the animals.
+            individuals: the names of all.
+        """
         self._arena, self._zones = build_arena(tracker.scene, self._plan)
+        self.follow(individuals)
+
+    def follow(self, individuals: Sequence[str]) -> None:
+        """Apply the rules to each of these animals."""
+        self._animals = [
+            _Watched(
+                name,
+                Track.empty(self._skeleton, np.zeros(0, np.int64)),
+                [self._new_onsets(rule) for rule in self._rules],
+                dict.fromkeys(self._acts, False),
+            )
+            for name in individuals
+        ]
 
     def write_to(self, log: Path) -> None:
         """Write all events to this file, a line each.
@@ -138,23 +173,25 @@ class TriggerWatch:
                 "folder with --out"
             ) from None
 
-    def add(self, arrival: Arrival, recent: Track) -> None:
+    def add(self, arrival: Arrival, recent: Sequence[Track]) -> None:
         """Apply the rules to the next frame.
 
         Args:
             arrival: the frame.
-            recent: the last rows of the online track, the frame's own the last.
+            recent: of each animal, the last rows of the online track, the frame's own the last.
         """
-        if self._window is None:
-            self._window, self._first_ns = recent, arrival.frame.time_ns
-        older = self._window[: int(np.searchsorted(self._window.times_ns, recent.times_ns[0]))]
-        self._window = _since(Track.join([older, recent]), _WINDOW_S)
-        values = self._values(self._window)
+        if not self._animals[0].window.n_frames:
+            self._first_ns = arrival.frame.time_ns
         time_s = 1e-9 * (arrival.frame.time_ns - self._first_ns)
-        for k, (rule, onsets) in enumerate(zip(self._rules, self._onsets, strict=True)):
-            on, off = rule.holds(values)
-            if onsets.add(time_s, bool(on[0]), bool(off[0])):
-                self._fire(k, arrival, time_s, float(values[rule.names[0]][0]))
+        for animal, rows in zip(self._animals, recent, strict=True):
+            older = animal.window[: int(np.searchsorted(animal.window.times_ns, rows.times_ns[0]))]
+            animal.window = _since(Track.join([older, rows]), _WINDOW_S)
+        for animal in self._animals:
+            values = self._values(animal)
+            for k, (rule, onsets) in enumerate(zip(self._rules, animal.onsets, strict=True)):
+                on, off = rule.holds(values)
+                if onsets.add(time_s, bool(on[0]), bool(off[0])):
+                    self._fire(k, animal, arrival, time_s, float(values[rule.names[0]][0]))
 
     def close(self) -> None:
         """Close senders and log, and account for the events of each rule."""
@@ -162,7 +199,11 @@ class TriggerWatch:
             sender.close()
         if self._log is not None:
             self._log.close()
-        self.accounts = [self._account(k) for k in range(len(self._rules))]
+        self.accounts = [
+            self._account(rule, one.name, [e for e in self.events if e["individual"] == one.name])
+            for one in self._animals
+            for rule in self._rules
+        ]
 
     def for_session(self, rows: Rows, measured: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
         """The table `triggers` and its notes, as `SessionWriter.close` takes them.
@@ -175,33 +216,58 @@ class TriggerWatch:
         acts = {name: np.isin(words, kinds) for name, kinds in self._acts.items()}
         values = values_of(self._names, rows, dict(measured["kinematics"]), acts)
         first_ns = int(rows.track.times_ns[0])
-        offset = np.full(len(self.events), np.nan)
-        for k, rule in enumerate(self._rules):
+        mine = self._events_of(rows)
+        offset = np.full(len(mine), np.nan)
+        accounts = []
+        for rule in self._rules:
             session_s = self._new_onsets(rule).of_frames(rows.time_s, *rule.holds(values))
-            own = [j for j, event in enumerate(self.events) if event["rule"] == rule.text]
-            live_s = np.array([1e-9 * (self.events[j]["time_ns"] - first_ns) for j in own])
+            own = [j for j, event in enumerate(mine) if event["rule"] == rule.text]
+            live_s = np.array([1e-9 * (mine[j]["time_ns"] - first_ns) for j in own])
             found = Agreement.of(live_s, session_s)
             offset[own] = 1e3 * found.offset_s
-            self.accounts[k] |= {
-                "n_session": len(session_s),
-                "precision": found.precision,
-                "recall": found.recall,
-                "tolerance_s": TOLERANCE_S,
-                "missed_s": found.missed_s.round(4).tolist(),
-            }
-        block: dict[str, Any] = {name: [event[name] for event in self.events] for name in _FACTS}
-        block["time_s"] = [1e-9 * (event["time_ns"] - first_ns) for event in self.events]
+            accounts.append(
+                self._account(rule, rows.individual, mine)
+                | {
+                    "n_session": len(session_s),
+                    "precision": found.precision,
+                    "recall": found.recall,
+                    "tolerance_s": TOLERANCE_S,
+                    "missed_s": found.missed_s.round(4).tolist(),
+                }
+            )
+        self.accounts = [
+            *(one for one in self.accounts if one["individual"] != rows.individual),
+            *accounts,
+        ]
+        block: dict[str, Any] = {name: [event[name] for event in mine] for name in _FACTS}
+        block["time_s"] = [1e-9 * (event["time_ns"] - first_ns) for event in mine]
         block |= {"session_id": rows.session_id, "individual": rows.individual}
         table = to_pandas(TRIGGERS, block | {"session_offset_ms": offset})
         stated = {**asdict(self._stated), "seed": self._plan.seed}
         return {
             "results": {"triggers": table},
             "columns": TRIGGERS,
-            "record": {"triggers": {"stated": stated, "rules": self.accounts}},
+            "record": {"triggers": {"stated": stated, "rules": accounts}},
         }
 
-    def _values(self, window: Track) -> dict[str, Array]:
-        """The values (1,) of all names in the last frame of a window."""
+    def _events_of(self, rows: Rows) -> list[dict[str, Any]]:
+        """The events of the animal of a finished session, whatever it was named then: of all, it
+        was the nearest one in the image.
+        """
+        track, names = rows.track, np.array([one.name for one in self._animals])
+        own = []
+        for event, places in zip(self.events, self._places, strict=True):
+            row = min(int(np.searchsorted(track.times_ns, event["time_ns"])), track.n_frames - 1)
+            off = np.linalg.norm(places - track.uv_px[row].mean(axis=0), axis=1)
+            off = np.where(np.isfinite(off), off, 1e9 + (names != rows.individual))
+            own += [event] if names[off.argmin()] == event["individual"] else []
+        return own
+
+    def _values(self, animal: _Watched) -> dict[str, Array]:
+        """The values (1,) of all names in the latest frame; NaN if it is unclear whose they are."""
+        window = animal.window
+        if window.flag[-1] == "unclear":
+            return dict.fromkeys(self._names, np.array([np.nan]))
         near = _since(window, _RATES_S)
         moved: dict[str, Array] = {}
         if self._moves:
@@ -209,15 +275,15 @@ class TriggerWatch:
             every = measures(Joints.of_track(near), seconds(near.times_ns), *limits)
             moved = {name: column[-1:] for name, column in every.items()}
         if self._acts:
-            self._act(window)
-        return values_of(self._names, self._rows(window[-1:]), moved, self._acting)
+            self._act(animal)
+        return values_of(self._names, self._rows(window[-1:]), moved, animal.acting)
 
-    def _act(self, window: Track) -> None:
-        """Decide on the actions in the last frame of a window.
+    def _act(self, animal: _Watched) -> None:
+        """Decide on the actions in the latest frame.
 
         A recognised action begins where its probability exceeds 0.8 and ends below 0.2.
         """
-        rows = self._rows(window)
+        window, rows = animal.window, self._rows(animal.window)
         if self._recogniser is not None:
             found = self._recogniser.recognise(window, rows.wall_distance_mm)
             chance = dict(zip(found.words, found.probability[-1].tolist(), strict=True))
@@ -228,7 +294,7 @@ class TriggerWatch:
         for name, kinds in self._acts.items():
             p = sum(chance.get(kind, 0.0) for kind in kinds)
             if not np.isnan(p):  # else nothing was measured
-                self._acting[name] = bool(p > (0.2 if self._acting[name] else 0.8))
+                animal.acting[name] = bool(p > (0.2 if animal.acting[name] else 0.8))
 
     def _rows(self, track: Track) -> Rows:
         return Rows(track, np.arange(track.n_frames), "", "", (), self._arena, self._zones)
@@ -238,16 +304,19 @@ class TriggerWatch:
         stated = self._stated.duration_s
         return Onsets(least if stated is None else stated, self._stated.refractory_s)
 
-    def _fire(self, k: int, arrival: Arrival, time_s: float, value: float) -> None:
+    def _fire(
+        self, k: int, animal: _Watched, arrival: Arrival, time_s: float, value: float
+    ) -> None:
         """Send an event, unless it is withheld or late, and log it."""
-        self._n_events[k] += 1
+        self._n_events[k, animal.name] += 1
         facts: dict[str, Any] = {
             "time_s": round(time_s, 6),
             "time_ns": int(arrival.frame.time_ns),
             "frame_index": int(arrival.frame.index),
             "rule": self._rules[k].text,
             "value": value,
-            "count": self._n_events[k],
+            "count": self._n_events[k, animal.name],
+            "individual": animal.name,
         }
         withheld = self._rng.random() >= self._stated.probability
         late = time.perf_counter() - arrival.at_s > _LATE_S
@@ -264,15 +333,20 @@ class TriggerWatch:
             "outcome": outcome,
         }
         self.events.append(facts)
+        self._places.append(np.array([one.window.uv_px[-1].mean(axis=0) for one in self._animals]))
         if self._log is not None:
             self._log.write(message(facts))
 
-    def _account(self, k: int) -> dict[str, Any]:
-        """What became of the events of a rule."""
-        own = [event for event in self.events if event["rule"] == self._rules[k].text]
+    @staticmethod
+    def _account(
+        rule: Rule, individual: str, events: Sequence[Mapping[str, Any]]
+    ) -> dict[str, Any]:
+        """What became of the events of a rule among those of an animal."""
+        own = [event for event in events if event["rule"] == rule.text]
         sent = [event["latency_ms"] for event in own if event["outcome"] == "sent"]
         return {
-            "rule": self._rules[k].text,
+            "rule": rule.text,
+            "individual": individual,
             "n_events": len(own),
             **{f"n_{one}": sum(e["outcome"] == one for e in own) for one in OUTCOMES},
             "latency_p95_ms": float(np.quantile(sent, 0.95)) if sent else None,

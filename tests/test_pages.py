@@ -133,7 +133,8 @@ CHANGED = {
     "docs/howto/sync.md": {"liex sync": f"{PULSES}liex sync"},
     "docs/howto/interactions.md": {"several.json": "several.json --frames 300 --recordings 1"},
     "docs/howto/trigger.md": {
-        "liex live SOURCE": "liex live 'synthetic:walk?seed=3&frames=40' --replay"
+        "liex live PAIR": "liex live 'synthetic:pair?seed=3&frames=120' --replay",
+        "liex live SOURCE": "liex live 'synthetic:walk?seed=3&frames=40' --replay",
     },
     "docs/tutorials/study.md": {
         "frames=90": "frames=40",

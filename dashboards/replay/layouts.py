@@ -15,7 +15,7 @@ from liex_lab.runtime.durable import replacing, write_whole
 from liex_lab.runtime.text_files import value_at
 from liex_lab.scene.height_maps import N_OBJECTS
 from liex_lab.sessions import Session, cutouts, rrd_scene, viewer
-from liex_lab.sessions.rrd import OVERLAY, SKELETON, TOGETHER, corrected_entity
+from liex_lab.sessions.rrd import ANIMALS, OVERLAY, SKELETON, TOGETHER, corrected_entity
 
 
 def write_blueprint(session: Session) -> Path:
@@ -36,8 +36,8 @@ def live_blueprint(body_m: float) -> Any:
     """
     image = rrb.Spatial2DView(
         origin="arena/camera/image",
-        contents=["$origin/**", f"+ /{SKELETON}/**"],
-        name="depth with the skeleton",
+        contents=["$origin/**", f"+ /{SKELETON}/**", f"+ /{ANIMALS}/**"],
+        name="depth with the skeletons",
     )
     error = rrb.TimeSeriesView(origin=viewer.ERROR, name="predicted error (mm)")
     return _blueprint(

@@ -378,13 +378,15 @@ def live(
     ] = 1.0,
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out", metavar="DIR", help="Make a session here when the recording is over."
-        ),
+        typer.Option("--out", metavar="DIR", help="Make sessions here when the recording is over."),
     ] = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Show skeletons in Rerun during a recording, trigger on rules, and measure the latency."""
+    """Show skeletons in Rerun during a recording, trigger on rules, and measure the latency.
+
+    With several animals (--set animal.count=2, or auto) their names are provisional, as only the
+    past is known; --out identifies them over the whole recording.
+    """
     chosen = load_plan(plan, settings or [])
     if send and not rules:
         raise LiexError("--send names a receiver, but no rule: state one with --trigger")
@@ -414,13 +416,20 @@ def live(
     for address, why in failed.items():
         echo(f"{address} did not take every message: {why}")
     for one in about:
-        echo(_trigger_sentence(one))
+        echo(_trigger_sentence(one, f" of {one['individual']}" if result["n_animals"] > 1 else ""))
+    if result["n_animals"] > 1:
+        final = "--out identifies" if out is None else "the sessions identify"
+        echo(
+            f"{result['n_animals']} animals, whose names are provisional, as only the past was "
+            f"known: they may have been exchanged at {result['n_unclear']} of "
+            f"{result['n_crossings']} crossings; {final} them over the whole recording"
+        )
 
 
-def _trigger_sentence(about: dict[str, Any]) -> str:
+def _trigger_sentence(about: dict[str, Any], whose: str) -> str:
     """What became of the events of one rule."""
     counts = (f"{about[f'n_{one}']} {one}" for one in ("sent", "withheld", "late", "failed"))
-    text = f"trigger '{about['rule']}': {about['n_events']} events ({', '.join(counts)})"
+    text = f"trigger '{about['rule']}'{whose}: {about['n_events']} events ({', '.join(counts)})"
     if about["latency_p95_ms"] is not None:
         text += f", 95 % sent within {about['latency_p95_ms']:.1f} ms of their frame"
     if "n_session" not in about:

@@ -576,6 +576,9 @@ def evaluate_live(
     n_cameras: Annotated[
         int, typer.Option("--cameras", min=1, max=16, help="Number of simultaneous cameras.")
     ] = 1,
+    n_animals: Annotated[
+        int, typer.Option("--animals", min=1, max=4, help="Number of mice in one arena.")
+    ] = 1,
     rules: Annotated[
         list[str] | None,
         typer.Option(
@@ -593,6 +596,7 @@ def evaluate_live(
         n_frames=n_frames,
         rate_hz=rate_hz,
         n_cameras=n_cameras,
+        n_animals=n_animals,
         rules=rules or (),
         progress=progress,
     )

@@ -16,6 +16,7 @@ import numpy as np
 import rerun as rr
 from rerun.experimental import ViewerClient
 
+from liex_lab.actions.vocabulary import individual_colours
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3
@@ -23,8 +24,8 @@ from liex_lab.optics.camera import Camera
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.runtime.processes import own_python
 from liex_lab.sessions.corrections import REPLAY
-from liex_lab.sessions.rrd import BONE_COLOUR, JOINT_COLOUR, SKELETON
-from liex_lab.sessions.rrd_scene import DEPTH, MM_PER_UNIT, colour_range, dot_mm, log_camera
+from liex_lab.sessions.rrd import ANIMALS, BONE_COLOUR, JOINT_COLOUR, SKELETON
+from liex_lab.sessions.rrd_scene import DEPTH, MM_PER_UNIT, colour_range, dot_mm, log_camera, rgba
 from liex_lab.sessions.session import Session
 from liex_lab.tracking.track import Track
 
@@ -175,16 +176,17 @@ ERROR = "error/predicted"
 
 
 class LiveView:
-    """A stream of depth and skeletons during a recording.
+    """A stream of depth and skeletons during a recording, as a session's replay shows them.
 
     Args:
         name: the recording's name.
         camera: the depth camera.
         T_arena_camera: transform from the camera frame (mm) to the arena frame.
-        skeleton: the animal's skeleton.
+        skeleton: the animals' skeleton.
         to: 'viewer' starts a viewer on this machine; a name ending in .rrd is a file to write; else
             the address of a viewer.
         blueprint: the layout, a Rerun blueprint; None if absent.
+        names: of the animals; a single one has no name and the usual colour.
 
     Raises:
         LiexError: there is no screen for a viewer.
@@ -198,6 +200,7 @@ class LiveView:
         skeleton: Skeleton,
         to: str,
         blueprint: Any = None,
+        names: Sequence[str] = ("",),
     ) -> None:
         self._edges = skeleton.edges
         self._stream = rr.RecordingStream(
@@ -212,30 +215,40 @@ class LiveView:
         self._floor_mm = float(T_arena_camera.translation[2])
         log_camera(self._stream, camera, T_arena_camera)
         dot_m = dot_mm(skeleton) / MM_PER_UNIT
-        dots = rr.Points3D.from_fields(radii=dot_m, colors=JOINT_COLOUR)
-        self._stream.log(f"{SKELETON}/joints", dots, static=True)
-        lines = rr.LineStrips3D.from_fields(radii=dot_m / 2.0, colors=BONE_COLOUR)
-        self._stream.log(f"{SKELETON}/bones", lines, static=True)
+        more = [rr.escape_entity_path_part(name) for name in names[1:]]
+        self._animals = [
+            (SKELETON, ERROR),
+            *((f"{ANIMALS}/{part}", f"{ERROR}/{part}") for part in more),
+        ]
+        colours = individual_colours(names)
+        for (entity, _), name in zip(self._animals, names, strict=True):
+            own: dict[str, Any] = {"colors": rgba([int(colours[name][1:], 16)])} if more else {}
+            dots = rr.Points3D.from_fields(radii=dot_m, **{"colors": JOINT_COLOUR, **own})
+            self._stream.log(f"{entity}/joints", dots, static=True)
+            own = {"colors": BONE_COLOUR, **own, **({"labels": [name]} if more else {})}
+            lines = rr.LineStrips3D.from_fields(radii=dot_m / 2.0, **own)
+            self._stream.log(f"{entity}/bones", lines, static=True)
         self._first_ns: int | None = None
         self._range: Any = None
 
-    def show(self, frame: DepthFrame, row: Track) -> None:
-        """Show the skeleton of one frame and, every fifth frame, the depth image.
+    def show(self, frame: DepthFrame, rows: Sequence[Track]) -> None:
+        """Show the skeletons of one frame and, every fifth frame, the depth image.
 
         Args:
             frame: the frame.
-            row: its track of one row; without a pose the last skeleton is cleared.
+            rows: of each animal its track of one row; without a pose the last skeleton is cleared.
         """
         self._first_ns = frame.time_ns if self._first_ns is None else self._first_ns
         self._stream.set_time("frame", sequence=frame.index)
         self._stream.set_time("time", duration=np.timedelta64(frame.time_ns - self._first_ns, "ns"))
-        posed = bool(row.posed[0])
-        joints_m = row.joints_mm[0] / MM_PER_UNIT
-        bones = [joints_m[list(edge)] for edge in self._edges]
-        self._stream.log(f"{SKELETON}/joints", rr.Points3D(joints_m if posed else []))
-        self._stream.log(f"{SKELETON}/bones", rr.LineStrips3D(bones if posed else []))
-        if posed:
-            self._stream.log(ERROR, rr.Scalars(float(row.predicted_error_mm[0])))
+        for (entity, error), row in zip(self._animals, rows, strict=True):
+            posed = bool(row.posed[0])
+            joints_m = row.joints_mm[0] / MM_PER_UNIT
+            bones = [joints_m[list(edge)] for edge in self._edges]
+            self._stream.log(f"{entity}/joints", rr.Points3D(joints_m if posed else []))
+            self._stream.log(f"{entity}/bones", rr.LineStrips3D(bones if posed else []))
+            if posed:
+                self._stream.log(error, rr.Scalars(float(row.predicted_error_mm[0])))
         # frames; an image takes longer to send than a skeleton
         if frame.index % 5 == 0:
             depth = np.clip(np.rint(frame.depth), 0, 65535).astype(np.uint16)

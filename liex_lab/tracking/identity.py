@@ -44,6 +44,9 @@ _OFF = 2.0  # nats, of a reading whose tag is two half lengths beyond the antenn
 _COVERED = 0.35  # hidden area, in animals, from which their poses are unknown
 _ONE = 1.4  # usual sizes of an outline, above which it shows several animals
 _JOIN_S = 0.5  # crossings nearer to each other are one
+_HIDES = 9.0  # cost of an animal that was in view and is not, nats
+_SIZES = 100  # frames over which the sizes of the animals of an ongoing recording are averaged
+_OF_COMPONENTS = {*COLUMNS} - {"times_ns", "has_depth", "repeats", "objects"}
 
 
 @dataclass(frozen=True)
@@ -185,36 +188,41 @@ def _by_tags(
     return best, emission, replace(identity, tags=tags)
 
 
-def own_observations(observed: Observations, slots: Slots) -> Observations:
+def own_observations(
+    observed: Observations, slots: Slots, usual_px: float | None = None
+) -> Observations:
     """The observations of one animal: its component's two hypotheses first, and no others.
 
     Args:
         observed: hypotheses (n, 2 N) of all components with its body.
         slots: (n,) its component, `NONE` if it is not in view.
+        usual_px: of an animal; None takes it from the frames in which all stand apart.
     """
     own = Observations.empty(observed.skeleton, observed.times_ns)
     rows = np.flatnonzero(slots != NONE)
     for name in COLUMNS:
         values, out = getattr(observed, name), getattr(own, name)
-        if name in ("has_depth", "repeats", "objects"):
+        if name not in _OF_COMPONENTS:
             out[:] = values
-        elif name != "times_ns":
+        else:
             for h in range(2):
                 out[rows, h] = values[rows, 2 * slots[rows] + h]
     touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < observed.score.shape[1] // 2
-    own.behind[touching, :2] = _covering(observed, touching)[touching, None]
+    own.behind[touching, :2] = _covering(observed, touching, usual_px)[touching, None]
     # of an outline that a neighbour cuts, the metric does not know which end is the head
     touching &= own.known[:, 0] & own.known[:, 1]
     own.score[touching, :2] = own.score[touching, :2].min(axis=1, keepdims=True)
     return own
 
 
-def _covering(observed: Observations, touching: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _covering(
+    observed: Observations, touching: NDArray[np.bool_], usual_px: float | None
+) -> NDArray[np.bool_]:
     """Whether (n,) touching animals cover each other: all in view show too little together."""
     known = observed.known[:, ::2]
     shown = np.where(known, observed.n_px[:, ::2], 0).sum(axis=1)
     apart = known.all(axis=1) & ~touching
-    usual = np.median(shown[apart]) / known.shape[1] if apart.any() else np.inf
+    usual = usual_px or (np.median(shown[apart]) / known.shape[1] if apart.any() else np.inf)
     return np.asarray(touching & (shown < (known.sum(axis=1) - _COVERED) * usual))
 
 
@@ -250,7 +258,7 @@ def doubt(crossings: Sequence[Crossing]) -> str:
 def _moves(observed: Observations, subject: Subject) -> Array:
     """Cost (m - 1, N, N) of one animal's way from each component to each of the next frame."""
     tuning = TrackingParameters.of(subject.skeleton.name).chain
-    chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning, 2)
+    chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning, several=True)
     n, n_hypotheses = observed.score.shape
     error = observed.error_mm.copy()
     for h in range(n_hypotheses):  # poses of animals that cover each other may be anywhere on them
@@ -484,3 +492,96 @@ def _follow(
         one_each = (observed.n_px[start:stop] <= _ONE * usual_px).all()
         if min(near) >= 0 and one_each and (ways[0] != ways[1]).any():
             yield start, stop
+
+
+class OnlineIdentity:
+    """Assigns the components of an ongoing recording's frames to animals, from the past alone.
+
+    The forward pass of the model of `identify`, from the first frame on in which all stand apart.
+    An animal that was out of view is likely to be near where it was seen last. What is likeliest
+    when a crossing has been over for half a second is taken as certain from there on.
+
+    Attributes:
+        p_swap: probability that animals have been exchanged in the present crossing, 0 without one.
+        crossings: that of each earlier crossing, at its end.
+
+    Args:
+        subjects: the animals, the largest first.
+    """
+
+    def __init__(self, subjects: Sequence[Subject]) -> None:
+        n_animals = len(subjects)
+        self._subject = subjects[0]
+        # the first one keeps the order
+        self._states = np.array(list(permutations(range(n_animals))))
+        self._cost = np.zeros(len(self._states))
+        # of each animal, in their order
+        self._last = Observations.empty(self._subject.skeleton, np.zeros(1, np.int64), n_animals)
+        self._last_s = np.full(n_animals, -np.inf)
+        self._size = np.zeros(n_animals)  # usual logarithm of pixels
+        self._until_s = np.inf  # of the present crossing, or until all stand apart
+        self.p_swap = 0.0
+        self.crossings: list[float] = []
+
+    def add(self, observed: Sequence[Observations]) -> list[Observations]:
+        """The observations of each animal in the next frame, as from `own_observations`.
+
+        Args:
+            observed: for each animal, the frame measured with its body.
+        """
+        first, n_animals = observed[0], len(observed)
+        if n_animals == 1:  # it may be either component
+            return list(observed)
+        now_s, known = 1e-9 * float(first.times_ns[0]), first.known[0, ::2]
+        size = np.log(np.maximum(first.n_px[0, ::2], 1))
+        touching = np.isfinite(first.objects[0, :, 0]).sum() < known.sum()
+        transition = self._transition(first, now_s, known)
+        cost = -np.logaddexp.reduce(-(self._cost[:, None] + transition), axis=0)
+        others = np.delete(transition[0], cost.argmin()) - transition[0, cost.argmin()]
+        begins = bool(self._until_s == np.inf and known.all() and not touching)
+        clear = begins or bool(not touching and others.min() > _UNCLEAR)
+        if begins:  # the largest first
+            cost = 99.0 * size[self._states] @ np.arange(n_animals)
+            self._size, self._until_s = np.sort(size)[::-1], -np.inf
+        elif clear and known.all():
+            off = ((size[self._states] - self._size) / _SIZE_SD) ** 2
+            weight = min((now_s - self._last_s.max()) / _INDEPENDENT_S, 1.0)
+            cost += 0.5 * weight * np.minimum(off.sum(axis=1), 18.0)
+        best = self._states[cost.argmin()]
+        self.p_swap = 1.0 - 1.0 / float(np.exp(cost.min() - cost).sum())
+        # from here on in the order of the likeliest assignment
+        order = np.argsort(best)[self._states]
+        self._cost[(order[:, None] == self._states).all(axis=2).argmax(axis=1)] = cost
+        if not clear:
+            self._until_s = max(self._until_s, now_s + _JOIN_S)
+        elif now_s > self._until_s:
+            self.crossings += [self.p_swap] if np.isfinite(self._until_s) else []
+            self._until_s, self.p_swap = -np.inf, 0.0
+            self._cost[1:] = np.inf
+            self._size += np.where(known, size - self._size[np.argsort(best)], 0.0)[best] / _SIZES
+        seen = np.flatnonzero(known[best])
+        self._last_s[seen] = now_s
+        to, of = ((2 * k[:, None] + (0, 1)).ravel() for k in (seen, best[seen]))
+        self._last.times_ns[:] = first.times_ns
+        for name in _OF_COMPONENTS:
+            getattr(self._last, name)[:, to] = getattr(first, name)[:, of]
+        slots, usual_px = np.where(known[best], best, NONE), float(np.exp(self._size).mean())
+        return [own_observations(one, slots[k : k + 1], usual_px) for k, one in enumerate(observed)]
+
+    def _transition(self, frame: Observations, now_s: float, known: NDArray[np.bool_]) -> Array:
+        """Cost (S, S) of going from one assignment of the latest observations to another one of a
+        frame, of whose N components some are known.
+        """
+        moves = _moves(Observations.join([self._last, frame]), self._subject)[0]
+        last, here = (one.centroid_mm[0, ::2, :2].astype(float) for one in (self._last, frame))
+        away = (now_s - self._last_s)[:, None]
+        sd = self._subject.length_mm * (_PLACE_SHARE + away)
+        off = np.linalg.norm(last[:, None] - here, axis=-1) / sd
+        moves = np.where(away > _GAP_S, 0.5 * off**2, moves)
+        moves[~np.isfinite(moves)] = 0.0
+        moves[:, ~known] = np.where(away > _GAP_S, 0.0, _HIDES)
+        transition = moves[self._states[:, None], self._states].sum(axis=-1)
+        # components that are not there are exchangeable
+        absent = np.argsort(self._states, axis=1)[:, ~known]
+        transition[:, (np.diff(absent, axis=1) < 0).any(axis=1)] = np.inf
+        return np.asarray(transition)

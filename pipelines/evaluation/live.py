@@ -1,9 +1,9 @@
 """Latency of live tracking and of its triggers: `liex evaluate live`.
 
-It renders up to 150 frames of a moving virtual animal, keeps them in memory and
-sends them through a local socket at the camera's pace, forwards and backwards: median and 95 %
-latency, ms, of all frames since the first one that arrived after its predecessors were processed,
-which excludes learning the background.
+It renders up to 150 frames of a moving virtual animal, or 600 of several mice that interact, keeps
+them in memory and sends them through a local socket at the camera's pace, forwards and backwards:
+median, 95 % and largest latency, ms, of all frames since the first one that arrived after its
+predecessors were processed, which excludes learning the background.
 
 With rules, a message of each of them is sent for every frame, and another process receives it by
 UDP: `message_p95_ms` is from the arrival of the frame to that of its message, of the same frames.
@@ -26,8 +26,10 @@ import numpy as np
 
 from liex_lab.behaviour.triggers import Onsets, Rule
 from liex_lab.body.skeleton import Skeleton
+from liex_lab.errors import LiexError
 from liex_lab.recordings import streaming
 from liex_lab.runtime.progress import Progress, silent
+from liex_lab.simulation.scenes.groups import film_group
 from liex_lab.simulation.simulator import world_of
 
 from ..build import plan_of
@@ -53,6 +55,7 @@ def evaluate_live(
     learn_frames: int = 90,
     rate_hz: float | None = None,
     n_cameras: int = 1,
+    n_animals: int = 1,
     rules: Sequence[str] = (),
     progress: Progress = silent,
 ) -> dict[str, Any]:
@@ -64,6 +67,7 @@ def evaluate_live(
         learn_frames: frames that background, floor and size are learned from.
         rate_hz: frames per second that are sent; None means the camera's own rate.
         n_cameras: number of simultaneous cameras, each in a separate process.
+        n_animals: mice in one arena that interact.
         rules: triggers of one camera, see `liex_lab.behaviour.triggers`.
         progress: called with the progress of rendering and tracking, if there is one camera.
 
@@ -73,10 +77,15 @@ def evaluate_live(
         `message_p95_ms`, from the arrival of a frame to that of its message in another process,
         `n_messages`, and in `triggers` the agreement with the finished session.
     """
+    if n_animals > 1 and (animal != "mouse" or rules):
+        raise LiexError(
+            "several animals are mice without triggers in this evaluation; state --animal mouse, "
+            "and measure triggers of one animal"
+        )
     if rules:
         film = partial(_film, animal, n_frames, learn_frames, rate_hz, _SEED, progress=progress)
         return {**_triggered(animal, n_frames, rules, film, progress), "protocol": LIVE_PROTOCOL}
-    film = partial(_film, animal, n_frames, learn_frames, rate_hz)
+    film = partial(_film, animal, n_frames, learn_frames, rate_hz, n_animals=n_animals)
     if n_cameras == 1:
         return {**film(_SEED, progress=progress), "protocol": LIVE_PROTOCOL}
     progress(0, None, f"filming with {n_cameras} cameras at once")
@@ -110,6 +119,7 @@ def _film(
     learn_frames: int,
     rate_hz: float | None,
     seed: int,
+    n_animals: int = 1,
     ready: Barrier | None = None,
     watches: Callable[[], TriggerWatch] | None = None,
     progress: Progress = silent,
@@ -117,11 +127,15 @@ def _film(
     """The numbers of one camera, which starts when all cameras are ready."""
     try:
         # frames rendered
-        filmed = world_of(Skeleton.load(animal)).motion(seed, min(150, n_frames))
         progress(0, None, "rendering frames")
+        filmed = (
+            world_of(Skeleton.load(animal)).motion(seed, min(150, n_frames))
+            if n_animals == 1
+            else film_group(seed, min(600, n_frames), animals=n_animals)[0]
+        )
         step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)
-        plan = plan_of(animal)
+        plan = plan_of(animal).with_settings([f"animal.count={n_animals}"])
         # 60 frames tracked beforehand, a thousand times as fast
         track_live(
             streaming.replayed(arriving[: learn_frames + 60], 1000.0),

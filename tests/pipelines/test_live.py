@@ -14,6 +14,7 @@ from liex_lab.plan import Plan
 from liex_lab.recordings import open_recording
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.streaming import growing, received, replayed
+from liex_lab.simulation.scenes.catalogue import film
 
 ADDRESS = "synthetic:walk?seed=3&frames=24&sensor=primesense-qvga&spine_mm=70"
 PLAN = Plan.load("mouse").with_settings(["animal.spine_mm=70"])
@@ -24,8 +25,8 @@ def test_skeletons_are_told_as_frames_come_and_the_whole_track_at_the_end():
     closed = []
 
     class View:
-        def show(self, frame, row):
-            shown.append((frame.index, bool(row.posed[0])))
+        def show(self, frame, rows):
+            shown.append((frame.index, bool(rows[0].posed[0])))
 
         def close(self):
             closed.append(True)
@@ -34,13 +35,29 @@ def test_skeletons_are_told_as_frames_come_and_the_whole_track_at_the_end():
     arriving = open_live(
         "synthetic:walk?seed=3&frames=48&sensor=kinect-v2&spine_mm=70", PLAN, replay=True
     )
-    numbers, tracked = track_live(arriving, PLAN, learn_frames=36, viewer=lambda *_: View())
+    numbers, (tracked,) = track_live(arriving, PLAN, learn_frames=36, viewer=lambda *_: View())
     assert closed == [True]
     assert [index for index, _ in shown] == list(range(48))
     assert sum(posed for _, posed in shown) >= 44
     assert tracked.track.n_frames == numbers["n_frames"] == 48
     assert numbers["n_measured"] >= 44
     assert 0 <= numbers["n_live"] <= 48
+
+
+def test_two_animals_are_followed_at_once_and_each_in_its_place():
+    scene = film("two-animals", 3, 60)
+    plan = Plan.load("mouse").with_settings(["animal.count=auto"])
+    numbers, tracks = track_live(replayed(scene, 1000.0), plan, learn_frames=40)
+    assert (numbers["n_animals"], numbers["n_frames"], numbers["n_unclear"]) == (2, 60, 0)
+    truth = [scene.camera.project(one.joints_camera).mean(axis=1) for one in scene.animals]
+    nearest = []
+    for one in tracks:
+        assert (one.track.flag == "").mean() > 0.7
+        middle = one.track.uv_px.mean(axis=1)
+        off = [np.nanmedian(np.linalg.norm(middle - place, axis=1)) for place in truth]
+        assert min(off) < 10.0
+        nearest.append(int(np.argmin(off)))
+    assert sorted(nearest) == [0, 1]
 
 
 def test_a_recording_that_grows_is_read_as_it_grows_and_over_when_nothing_comes():

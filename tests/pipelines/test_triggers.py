@@ -66,7 +66,6 @@ def test_what_cannot_be_used_is_refused_before_the_recording_is_opened(tmp_path:
         (["--trigger", "in nest"], "the plan draws none"),
         (["--trigger", "walk", "--send", "ftp://a"], "a trigger is sent to udp://"),
         (["--send", "udp://127.0.0.1:9"], "names a receiver, but no rule"),
-        (["--set", "animal.count=2"], "follows one animal"),
     ):
         found = CliRunner().invoke(cli.app, ["live", "no/such/file", "--to", "none", *options])
         assert isinstance(found.exception, LiexError)
@@ -81,11 +80,12 @@ def _fired(watch: TriggerWatch, monkeypatch: pytest.MonkeyPatch, n: int = 400) -
     """Outcomes of n events in n pairs of frames."""
     row = Track.empty(watch_skeleton(), np.zeros(1, np.int64))
     holds = iter(np.tile([1.0, 0.0], n).tolist())
+    watch.follow(["animal"])
     monkeypatch.setattr(watch, "_values", lambda _: {"walk": np.array([next(holds)])})
     for k in range(2 * n):
         row.times_ns[:] = k * 10**9
         frame = DepthFrame(k, k * 10**9, np.zeros((1, 1), np.float32))
-        watch.add(Arrival(frame, time.perf_counter() if k < 2 * n - 2 else 0.0), row)
+        watch.add(Arrival(frame, time.perf_counter() if k < 2 * n - 2 else 0.0), [row])
     watch.close()
     return [event["outcome"] for event in watch.events]
 

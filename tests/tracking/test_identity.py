@@ -8,6 +8,8 @@ import pytest
 from liex_lab.tracking.curve import track_whole
 from liex_lab.tracking.identity import (
     CERTAIN,
+    UNCLEAR,
+    OnlineIdentity,
     doubt,
     flag_unclear,
     identify,
@@ -178,3 +180,60 @@ def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
     ]
     assert doubt([Crossing(0, 1, (0, 1), 1.0 - CERTAIN - 1e-9, "motion")]) == ""
     assert "70% certain" in doubt([unclear])
+
+
+def followed(seen: Observations, n_animals: int = 2) -> tuple[OnlineIdentity, np.ndarray]:
+    """The online identities after all frames, and where each animal (n, N, 2) was said to be."""
+    online = OnlineIdentity([SUBJECT] * n_animals)
+    places = []
+    for k in range(len(seen)):
+        own = online.add([seen[k : k + 1]] * n_animals)
+        places.append([one.place[0, 0, :2] for one in own])
+    return online, np.array(places)
+
+
+@pytest.mark.parametrize("n_animals", [2, 3])
+def test_during_a_recording_each_animal_keeps_its_name_from_the_past_alone(n_animals: int) -> None:
+    seen = mixed(n_animals, shuffled(n_animals))
+    online, places = followed(seen, n_animals)
+    of = [walk.root.translation[:, :2] for walk in WALKS[:n_animals]]
+    off = np.array(
+        [[np.linalg.norm(places[:, k] - one, axis=1) for one in of] for k in range(n_animals)]
+    )
+    nearest = off.argmin(axis=1)
+    assert (nearest == nearest[:, :1]).all()
+    assert sorted(nearest[:, 0]) == [*range(n_animals)]
+    assert online.crossings == []
+
+
+@pytest.mark.parametrize(("ratio", "is_clear"), [(1.0, False), (1.5, True)])
+def test_during_a_recording_a_meeting_is_open_and_sizes_decide_it(
+    ratio: float, is_clear: bool
+) -> None:
+    seen = mixed(2, np.tile([0, 1], (len(SECONDS), 1)))
+    middle = 0.5 * (seen.place[:, :1] + seen.place[:, 2:3])
+    apart = np.clip(np.abs(np.arange(len(SECONDS)) - 47.0) / 400.0, 0.0, 1.0)  # they meet slowly
+    seen.place[:] = middle + apart[:, None, None] * (seen.place - middle)
+    seen.centroid_mm[:] = seen.place
+    seen.n_px[:, :2] = round(800 * ratio)
+    lose(seen, LOST)
+    online, chances = OnlineIdentity([SUBJECT] * 2), []
+    for k in range(len(seen)):
+        online.add([seen[k : k + 1]] * 2)
+        chances.append(online.p_swap)
+    assert max(chances[:20]) < 0.01
+    assert chances[LOST.stop] > UNCLEAR
+    assert chances[-1] == 0.0, "what is likeliest is taken as certain"
+    assert (max(online.crossings) < UNCLEAR) == is_clear
+
+
+def test_during_a_recording_an_animal_that_hides_does_not_take_the_name_of_the_other() -> None:
+    seen = mixed(2, np.tile([0, 1], (len(SECONDS), 1)))
+    for name in POSE[:-2]:
+        getattr(seen, name)[30:60, 2:] = np.nan
+    seen.n_px[30:60, 2:] = 0
+    online, places = followed(seen)
+    first = int(np.isfinite(places[40, 1, 0]))
+    assert np.isnan(places[30:60, 1 - first]).all()
+    assert np.abs(np.diff(places[:, first], axis=0)).max() < 20.0
+    assert max([0.0, *online.crossings]) < UNCLEAR
