@@ -300,7 +300,7 @@ class SessionWriter:
         self._crossings = tracked.crossings
         memory.release_memory()  # much memory after a long recording
         self._candidates = observations if self.origin.replay_candidates else None
-        self._together = observations if subject.n_rivals > 1 else None
+        self._together = observations if subject.n_animals > subject.n_measured else None
         write_evidence(self._folder, observations, subject)
 
     @property

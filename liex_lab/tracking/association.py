@@ -17,7 +17,7 @@ from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Array, Observations
 from liex_lab.tracking.smoother import AssociationCosts
-from liex_lab.tracking.trust import head_tail_weight, together, usual_pixels
+from liex_lab.tracking.trust import head_tail_weight
 
 _BLOCK = 16_384  # frames in memory at once
 _BESIDE = 256  # and context frames, for velocities
@@ -38,7 +38,7 @@ class HypothesisAssociation:
             movement.
         length_mm: spine length of the animal, mm.
         tuning: costs.
-        n_animals: how many animals are in view at once.
+        several: whether animals are distinguished by it, which differ only in position.
     """
 
     def __init__(
@@ -46,17 +46,16 @@ class HypothesisAssociation:
         skeleton: Skeleton,
         length_mm: float,
         tuning: AssociationCosts,
-        n_animals: int = 1,
+        several: bool = False,
     ) -> None:
         self._tuning = tuning
-        self._alone = n_animals < 2
         self._skeleton = skeleton
         self._length_mm = length_mm
         self._score_mm = tuning.score_mm * skeleton.relative_size
         n = skeleton.n_joints
         self._joints = sorted({round(k) for k in np.linspace(0, n - 1, min(n, 8))})
         t = tuning
-        jump = t.ceiling * (1.0 if self._alone else 20.0)  # several animals differ only in position
+        jump = t.ceiling * (20.0 if several else 1.0)
         costs = t.error_factor, t.shift, t.bend, t.tail, t.ceiling, jump, length_mm
         self.costs = kernels.TransitionCosts(*map(float, costs))
 
@@ -100,11 +99,6 @@ class HypothesisAssociation:
             emission = emission.copy()
             emission[: len(decided)][np.arange(h) != decided[:, None]] = np.inf
         missed = np.where(observed.known.any(axis=1), self._tuning.none, 0.0)
-        if not self._alone:  # the pose of touching animals may be that of any of them
-            first = np.where(observed.known[:, 0], 0, NONE)
-            missed[together(observed, first, usual_pixels(observed, first))] *= (
-                0.1  # cheaper to skip
-            )
         missed_cost = np.concatenate([[0.0], np.cumsum(missed)])
         parent = allocate((n, h, 2), np.int64)
         # 24 chains are kept
@@ -124,11 +118,6 @@ class HypothesisAssociation:
         self, observed: Observations, joints: NDArray[np.float32], allocate: Allocator = np.empty
     ) -> Array:
         """Emission cost of each hypothesis: its capped score, and the cost of moving tail first.
-
-        Of several animals, the one whose build is closer to the training data scores better in
-        every frame, which is no reason to switch to it. The cost of a component's likelier
-        direction, up to the cost of skipping a frame, is therefore ignored; the difference between
-        its directions is kept.
 
         Args:
             observed: hypotheses (n, H).
@@ -150,8 +139,6 @@ class HypothesisAssociation:
                 ahead = joints[around, :, -1] - joints[around, :, 0]
                 backward = backward_cost(observed[around], ahead, self._length_mm)
                 part += backward[rows.start - first :][: len(part)]
-            if not self._alone:
-                part -= np.minimum(np.fmin(part, part[:, other]), tuning.none)
             cost[rows] = part
         if self._skeleton.is_chain:
             weight = head_tail_weight(observed) * self.independent(observed)
@@ -293,76 +280,3 @@ def backward_cost(observed: Observations, ahead: NDArray[np.float32], length_mm:
     step = np.minimum(np.diff(seconds, prepend=seconds[:1]), _AROUND_S)
     # 60 nats/s at twice that speed
     return np.asarray(60.0 * step[:, None] * share)
-
-
-# Selection of one of two animals in view by size, if their sizes differ.
-
-
-_MOST = 2.0  # largest evidence of a frame, nats
-
-
-def cost_of_the_other(observed: Observations, path: NDArray[np.int64]) -> Array | None:
-    """The cost (n, H) of each hypothesis for belonging to the other of two animals, nats.
-
-    The log-normal likelihood ratio of one order of sizes over the other, at most 2 nats a frame.
-    The target is the animal, larger or smaller, that the session's body fits clearly better,
-    because its size and girth were measured on that one; otherwise the majority on the path.
-
-    Args:
-        observed: hypotheses (n, H) of the frames, the second component's after the first's.
-        path: (n,) index of the hypothesis, negative for none.
-
-    Returns:
-        0 if only one component is in view; None if sizes do not distinguish the animals.
-    """
-    first, second = observed.n_px[:, 0], observed.n_px[:, 2]
-    apart = observed.known[:, 0] & observed.known[:, 2] & (first != second)
-    apart &= np.minimum(first, second) > 0  # sessions without pixel counts have none
-    ratio = np.zeros(len(observed))
-    ratio[apart] = np.log(first[apart] / second[apart])
-    if apart.sum() < _FEWEST:
-        return None
-    size = np.abs(ratio[apart])
-    usual = float(np.median(size))
-    noise = max(0.08, 1.4826 * float(np.median(np.abs(size - usual))))
-    followed = apart & (path >= 0)
-    own = np.where(path >= 2, -ratio, ratio)[followed]
-    # smaller differences are none
-    if usual < 0.08 or not len(own) or not _keeps_order(own, np.flatnonzero(followed)):
-        return None
-    is_larger = _better_fit(observed, ratio, apart) or (1.0 if own.sum() > 0.0 else -1.0)
-    evidence = np.clip(2.0 * is_larger * usual / noise**2 * ratio, -_MOST, _MOST)
-    cost = np.zeros(observed.score.shape)
-    cost[:, :2] = np.maximum(-evidence, 0.0)[:, None]
-    cost[:, 2:] = np.maximum(evidence, 0.0)[:, None]
-    return cost
-
-
-def _better_fit(observed: Observations, ratio: Array, apart: NDArray[np.bool_]) -> float:
-    """1 if the session's body fits the larger one clearly better, -1 if the smaller one, else 0, by
-    their residuals in the frames `apart` (n,).
-    """
-    first, second = (observed.residual_mm[apart, h].astype(float) for h in (0, 2))
-    first_larger = ratio[apart] > 0.0
-    larger = np.where(first_larger, first, second)
-    smaller = np.where(first_larger, second, first)
-    known = np.isfinite(larger) & np.isfinite(smaller)
-    if known.sum() < _FEWEST:
-        return 0.0
-    off = float(np.log(np.median(smaller[known]) / max(np.median(larger[known]), 1e-9)))
-    # a larger ratio indicates another body
-    return float(np.sign(off)) if abs(off) > np.log(1.5) else 0.0
-
-
-def _keeps_order(own: Array, frames: NDArray[np.int64]) -> bool:
-    """Whether the tracked component is always the larger, or always the smaller one, while both are
-    apart.
-
-    Args:
-        own: (k,) logarithm of its pixels over the other's.
-        frames: (k,) their indices; both may have touched in missing frames.
-    """
-    begins = np.concatenate([[0], np.flatnonzero(np.diff(frames) > 1) + 1])
-    n = np.diff(np.append(begins, len(own)))
-    larger = np.add.reduceat((own > 0).astype(int), begins)
-    return bool(np.maximum(larger, n - larger).sum() >= 0.9 * len(own))

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from liex_lab.recordings.timestamps import GAP_FACTOR, median_step
 from liex_lab.runtime.memory import Allocator, blocks
-from liex_lab.tracking.association import NONE, HypothesisAssociation, cost_of_the_other
+from liex_lab.tracking.association import NONE, HypothesisAssociation
 from liex_lab.tracking.counting import count_animals
 from liex_lab.tracking.observations import Array, Observations, reversed_pose
 from liex_lab.tracking.smoother import TrackingParameters, smooth
@@ -211,15 +211,10 @@ def _associate(
     subject: Subject, observed: Observations, tuning: TrackingParameters, allocate: Allocator
 ) -> tuple[NDArray[np.int64], Array]:
     """The path (n,) of the animal's hypotheses, and its flip posterior (n,)."""
-    chain = HypothesisAssociation(
-        subject.skeleton, subject.length_mm, tuning.chain, subject.n_rivals
-    )
+    chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning.chain)
     joints = chain.joints(observed, allocate)
     emission = chain.emission(observed, joints, allocate)
     path = chain.path(observed, joints, emission, allocate=allocate)
-    if subject.n_rivals > 1 and (other := cost_of_the_other(observed, path)) is not None:
-        emission += chain.independent(observed) * other
-        path = chain.path(observed, joints, emission, allocate=allocate)
     return path, chain.doubt(observed, path, joints, emission, allocate)
 
 
@@ -378,9 +373,7 @@ class OnlineTracker:
         self._subject = subject
         self._lag = lag
         self._motion = tuning.motion
-        self._chain = HypothesisAssociation(
-            subject.skeleton, subject.length_mm, tuning.chain, subject.n_rivals
-        )
+        self._chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning.chain)
         self._window = Observations.empty(subject.skeleton, np.zeros(0, np.int64))
         # joints of the window's hypotheses that the association uses
         self._joints = self._chain.joints(self._window)

@@ -372,18 +372,16 @@ class SampleFit:
 # Occlusion correction: an animal with one end hidden is shifted along its axis.
 
 
+_NEARER_MM = 25.0  # of an object in front of an animal's edge
 _REACH_PX = 3  # pixels next to the edge, often unread by a sensor
 
 
-def behind_something(
-    crops: HeightMaps, depths: NDArray[np.float32], nearer_mm: float = 25.0
-) -> Array:
+def behind_something(crops: HeightMaps, depths: NDArray[np.float32]) -> Array:
     """The share of each animal's outline that ends at a nearer object or at the image edge.
 
     Args:
         crops: n height maps.
         depths: (n, H, W) float32 mm, the depth images that they were cut from, 0 where unread.
-        nearer_mm: than the animal's edge is in front of it.
 
     Returns:
         (n,) 0 to 1; 0 if nothing was found.
@@ -396,7 +394,7 @@ def behind_something(
         crops.origin,
         crops.step,
         depths,
-        nearer_mm,
+        _NEARER_MM,
         _REACH_PX,
         out,
     )

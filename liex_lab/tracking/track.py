@@ -325,11 +325,6 @@ class Subject:
     n_animals: int = 1
     n_measured: int = 1
 
-    @property
-    def n_rivals(self) -> int:
-        """How many animals its hypotheses may belong to, itself included."""
-        return max(1, self.n_animals - self.n_measured + 1)
-
 
 # Gaps between measured frames, in seconds, and runs of frames.
 

@@ -635,6 +635,6 @@ def doubted(
         n_animals: (n,) animals in view.
     """
     found = contradicted(observed, path, subject.length_mm) | (in_view < WHOLE)
-    if subject.n_rivals > 1:
+    if subject.n_animals > subject.n_measured:
         found |= together(observed, path, usual_px) | (n_animals > subject.n_measured)
     return found

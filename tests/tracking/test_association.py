@@ -108,67 +108,6 @@ def test_a_second_in_which_the_metric_errs_alike_in_every_frame_does_not_turn_an
         assert ((path_of(CHAIN, seen)[:30] == 0).all()) == (rate == 30.0)
 
 
-def two_animals(n: int = 90) -> tuple[Observations, np.ndarray]:
-    """Two mice 200 mm apart, the likelier one first in each frame; and where the second of them is.
-
-    For the first ten frames the second one is the likelier by 2 nats, then the first one is.
-    """
-    clock = np.arange(n) / 30.0
-    here = walk(clock)
-    there = walk(clock)
-    there.root.translation[:, 0] += 200.0
-    seen = told(clock, here)
-    other = told(clock, there)
-    first = np.arange(n) < 10
-    for name in ("turn", "place", "angles", "scale", "error_mm", "score", "n_px"):
-        ours, theirs = (getattr(one, name)[:, :2].copy() for one in (seen, other))
-        mask = first.reshape(-1, *[1] * (ours.ndim - 1))
-        getattr(seen, name)[:, :2] = np.where(mask, theirs, ours)
-        getattr(seen, name)[:, 2:] = np.where(mask, ours, theirs)
-    seen.score[:, 2:] = seen.score[:, :2] + 2.0 * COSTS.score_mm
-    return seen, np.where(first, 0, 2)
-
-
-def test_of_two_animals_the_one_that_is_followed_stays_the_one_that_was_followed():
-    seen, second = two_animals()
-    path = path_of(HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2), seen)
-    assert len(set((path // 2 * 2 == second).tolist())) == 1
-    alone = path_of(CHAIN, seen)  # of which one is no animal: the likelier one is taken in the end
-    assert (alone[30:] == 0).all()
-
-
-def test_while_two_animals_touch_no_pose_of_both_is_a_reason_to_change_over():
-    """In three of four frames of a second both are one thing, whose pose is first that of one and
-    then that of the other, 100 mm away; the frames between tell them apart.
-    """
-    n = 60
-    clock = np.arange(n) / 30.0
-    there = walk(clock)
-    there.root.translation[:, 0] += 100.0
-    seen = told(clock, walk(clock))
-    other = told(clock, there)
-    rows = np.arange(n)
-    joined = (rows >= 20) & (rows < 44) & (rows % 4 > 0)
-    of_other = joined & (rows >= 32)
-    for name in ("turn", "place", "angles", "scale", "error_mm", "score", "n_px"):
-        ours, theirs = (getattr(one, name) for one in (seen, other))
-        ours[of_other, :2] = theirs[of_other, :2]
-        ours[~joined, 2:] = theirs[~joined, :2]
-    seen.n_px[joined, :2] = 1600
-    path = path_of(HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2), seen)
-    one = path[0]
-    assert one in (0, 2)
-    assert (path[~joined] == one).all()
-    assert (path[of_other if one == 0 else joined & ~of_other] == NONE).all()
-
-
-def test_head_and_tail_of_one_of_two_animals_are_told_as_those_of_a_lone_one():
-    seen, _ = two_animals()
-    seen.score[:, [0, 2]], seen.score[:, [1, 3]] = seen.score[:, [1, 3]], seen.score[:, [0, 2]]
-    path = path_of(HypothesisAssociation(MOUSE, MOUSE.length, COSTS, 2), seen)
-    assert (path % 2 == 1).all()
-
-
 def test_in_a_long_contact_the_smoother_fit_does_not_turn_an_animal_round():
     clock = np.arange(300) / 30.0
     seen = told(clock, walk(clock))
