@@ -6,7 +6,6 @@ have in it.
 """
 
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -94,7 +93,8 @@ class TriggerWatch:
     """Applies rules to every frame of a live recording; sends and logs their events.
 
     Attributes:
-        events: all so far, in order: the facts of a message and of the table `triggers`.
+        events: all so far, in order: the facts of a message and of the table `triggers`, and the
+            places (N, 2) of all animals in the image, px.
         accounts: of each rule and animal, what became of its events and, once there is a session,
             their agreement with its own.
         problems: receivers that failed, and why.
@@ -123,9 +123,7 @@ class TriggerWatch:
         moving = {one.name for kind in KINDS for one in table_columns("kinematics", kind)}
         self._moves = bool(self._names & moving)
         self._stated, self._plan = stated, plan
-        self._n_events = Counter[tuple[int, str]]()
         self._animals: list[_Watched] = []
-        self._places: list[Array] = []  # (N, 2) px of all animals at each event
         self._senders = {address: open_sender(address) for address in stated.addresses}
         self._rng = np.random.default_rng(plan.seed)
         self._log: TextIO | None = None
@@ -256,9 +254,9 @@ class TriggerWatch:
         """
         track, names = rows.track, np.array([one.name for one in self._animals])
         own = []
-        for event, places in zip(self.events, self._places, strict=True):
+        for event in self.events:
             row = min(int(np.searchsorted(track.times_ns, event["time_ns"])), track.n_frames - 1)
-            off = np.linalg.norm(places - track.uv_px[row].mean(axis=0), axis=1)
+            off = np.linalg.norm(event["places_px"] - track.uv_px[row].mean(axis=0), axis=1)
             off = np.where(np.isfinite(off), off, 1e9 + (names != rows.individual))
             own += [event] if names[off.argmin()] == event["individual"] else []
         return own
@@ -308,14 +306,14 @@ class TriggerWatch:
         self, k: int, animal: _Watched, arrival: Arrival, time_s: float, value: float
     ) -> None:
         """Send an event, unless it is withheld or late, and log it."""
-        self._n_events[k, animal.name] += 1
+        own = (self._rules[k].text, animal.name)
         facts: dict[str, Any] = {
             "time_s": round(time_s, 6),
             "time_ns": int(arrival.frame.time_ns),
             "frame_index": int(arrival.frame.index),
             "rule": self._rules[k].text,
             "value": value,
-            "count": self._n_events[k, animal.name],
+            "count": 1 + sum((e["rule"], e["individual"]) == own for e in self.events),
             "individual": animal.name,
         }
         withheld = self._rng.random() >= self._stated.probability
@@ -332,8 +330,8 @@ class TriggerWatch:
             "sent_time_ns": time.time_ns(),
             "outcome": outcome,
         }
-        self.events.append(facts)
-        self._places.append(np.array([one.window.uv_px[-1].mean(axis=0) for one in self._animals]))
+        places = [one.window.uv_px[-1].mean(axis=0) for one in self._animals]
+        self.events.append(facts | {"places_px": np.array(places)})
         if self._log is not None:
             self._log.write(message(facts))
 

@@ -244,7 +244,7 @@ def _bridge_and_flag(
     # the behaviour of an animal that stays half hidden is unknown
     bridged &= ~unknown | whole_gaps(seconds, measured, subject.bridge_s)
     hidden |= unknown & ~bridged
-    strayed |= doubted(subject, observed, path, in_view, usual_px, track.n_animals)
+    strayed |= doubted(subject, observed, path, in_view, track.n_animals)
     masks = measured | copies, bridged, strayed
     for rows in blocks(len(observed), _BLOCK):
         part = track[rows]

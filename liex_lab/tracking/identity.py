@@ -34,7 +34,7 @@ CERTAIN = 0.9  # least certainty for statistics per animal
 _SIZE_SD = 0.15  # of the logarithm of an animal's pixels, from posture to posture
 _GAP_S = 0.1  # time without all animals in view over which they are continued
 _VELOCITY_S = 0.2  # time over which their velocity is measured
-_STRETCH_SD = 0.04  # that of its mean over a stretch, of 0.015 of virtual mice
+_STRETCH_SD = 0.04  # that of its mean over a stretch: 0.015 in virtual mice, with a margin
 _PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
 _MOST_NATS = 9.0  # of one frame
 _NOISE_MM = 0.3  # distance of a body from the depth below which there is no better one
@@ -518,7 +518,7 @@ class OnlineIdentity:
         # of each animal, in their order
         self._last = Observations.empty(self._subject.skeleton, np.zeros(1, np.int64), n_animals)
         self._last_s = np.full(n_animals, -np.inf)
-        self._size = np.zeros(n_animals)  # usual logarithm of pixels
+        self._usual_px = 1.0
         self._until_s = np.inf  # of the present crossing, or until all stand apart
         self.p_swap = 0.0
         self.crossings: list[float] = []
@@ -533,20 +533,30 @@ class OnlineIdentity:
         if n_animals == 1:  # it may be either component
             return list(observed)
         now_s, known = 1e-9 * float(first.times_ns[0]), first.known[0, ::2]
-        size = np.log(np.maximum(first.n_px[0, ::2], 1))
-        touching = np.isfinite(first.objects[0, :, 0]).sum() < known.sum()
-        transition = self._transition(first, now_s, known)
+        moves = _moves(Observations.join([self._last, first]), self._subject)[0]
+        last, here = (one.centroid_mm[0, ::2, :2].astype(float) for one in (self._last, first))
+        away = (now_s - self._last_s)[:, None]
+        off = np.linalg.norm(last[:, None] - here, axis=-1) / (_PLACE_SHARE + away)
+        moves = np.where(away > _GAP_S, 0.5 * (off / self._subject.length_mm) ** 2, moves)
+        moves[~np.isfinite(moves)] = 0.0
+        moves[:, ~known] = np.where(away > _GAP_S, 0.0, _HIDES)
+        transition = moves[self._states[:, None], self._states].sum(axis=-1)
+        # components that are not there are exchangeable
+        absent = np.argsort(self._states, axis=1)[:, ~known]
+        transition[:, (np.diff(absent, axis=1) < 0).any(axis=1)] = np.inf
         cost = -np.logaddexp.reduce(-(self._cost[:, None] + transition), axis=0)
         others = np.delete(transition[0], cost.argmin()) - transition[0, cost.argmin()]
+        touching = np.isfinite(first.objects[0, :, 0]).sum() < known.sum()
         begins = bool(self._until_s == np.inf and known.all() and not touching)
         clear = begins or bool(not touching and others.min() > _UNCLEAR)
-        if begins:  # the largest first
-            cost = 99.0 * size[self._states] @ np.arange(n_animals)
-            self._size, self._until_s = np.sort(size)[::-1], -np.inf
+        misfit = np.concatenate([*map(_misfit, observed)])
+        fit = misfit[np.arange(n_animals), self._states].sum(axis=1)
+        if begins:  # of one body, the largest first
+            cost = fit + 1e-6 * first.n_px[0, ::2][self._states] @ np.arange(n_animals)
+            self._usual_px, self._until_s = float(first.n_px[0, ::2].mean()), -np.inf
         elif clear and known.all():
-            off = ((size[self._states] - self._size) / _SIZE_SD) ** 2
-            weight = min((now_s - self._last_s.max()) / _INDEPENDENT_S, 1.0)
-            cost += 0.5 * weight * np.minimum(off.sum(axis=1), 18.0)
+            weight = min(float(away.min()) / _INDEPENDENT_S, 1.0)
+            cost += weight * np.minimum(fit - fit.min(), _MOST_NATS)
         best = self._states[cost.argmin()]
         self.p_swap = 1.0 - 1.0 / float(np.exp(cost.min() - cost).sum())
         # from here on in the order of the likeliest assignment
@@ -558,30 +568,15 @@ class OnlineIdentity:
             self.crossings += [self.p_swap] if np.isfinite(self._until_s) else []
             self._until_s, self.p_swap = -np.inf, 0.0
             self._cost[1:] = np.inf
-            self._size += np.where(known, size - self._size[np.argsort(best)], 0.0)[best] / _SIZES
+            self._usual_px += (first.n_px[0, ::2][known].mean() - self._usual_px) / _SIZES
         seen = np.flatnonzero(known[best])
         self._last_s[seen] = now_s
         to, of = ((2 * k[:, None] + (0, 1)).ravel() for k in (seen, best[seen]))
         self._last.times_ns[:] = first.times_ns
         for name in _OF_COMPONENTS:
             getattr(self._last, name)[:, to] = getattr(first, name)[:, of]
-        slots, usual_px = np.where(known[best], best, NONE), float(np.exp(self._size).mean())
-        return [own_observations(one, slots[k : k + 1], usual_px) for k, one in enumerate(observed)]
-
-    def _transition(self, frame: Observations, now_s: float, known: NDArray[np.bool_]) -> Array:
-        """Cost (S, S) of going from one assignment of the latest observations to another one of a
-        frame, of whose N components some are known.
-        """
-        moves = _moves(Observations.join([self._last, frame]), self._subject)[0]
-        last, here = (one.centroid_mm[0, ::2, :2].astype(float) for one in (self._last, frame))
-        away = (now_s - self._last_s)[:, None]
-        sd = self._subject.length_mm * (_PLACE_SHARE + away)
-        off = np.linalg.norm(last[:, None] - here, axis=-1) / sd
-        moves = np.where(away > _GAP_S, 0.5 * off**2, moves)
-        moves[~np.isfinite(moves)] = 0.0
-        moves[:, ~known] = np.where(away > _GAP_S, 0.0, _HIDES)
-        transition = moves[self._states[:, None], self._states].sum(axis=-1)
-        # components that are not there are exchangeable
-        absent = np.argsort(self._states, axis=1)[:, ~known]
-        transition[:, (np.diff(absent, axis=1) < 0).any(axis=1)] = np.inf
-        return np.asarray(transition)
+        slots = np.where(known[best], best, NONE)
+        return [
+            own_observations(one, slots[k : k + 1], self._usual_px)
+            for k, one in enumerate(observed)
+        ]

@@ -107,26 +107,6 @@ def median_of_whole(shown: Array, behind: Array) -> float:
     return finite_median(shown[whole] if whole.sum() >= 12 else shown, 0.0)
 
 
-def together(observed: Observations, path: NDArray[np.int64], usual_px: float) -> NDArray[np.bool_]:
-    """Whether (n,) an animal touches another, so that both are one component of the depth image.
-
-    The size of both is estimated from the frames in which they are separate components.
-
-    Args:
-        observed: hypotheses (n, H) of the frames.
-        path: (n,) index of the hypothesis, negative for none.
-        usual_px: the animal's usual number of pixels.
-    """
-    shown = observed.along(observed.n_px, path)
-    others = np.where(observed.known & (observed.n_px != shown[:, None]), observed.n_px, 0).max(
-        axis=1
-    )
-    other_px = finite_median(others[(path >= 0) & (others > 0)], np.inf)
-    # where both touch, each hides a part of the other
-    most_px = np.clip(usual_px + 0.4 * other_px, 1.25 * usual_px, _SHOWN[1] * usual_px)
-    return np.asarray((path >= 0) & (shown > most_px))
-
-
 def share_in_view(observed: Observations, path: NDArray[np.int64], usual_px: float) -> Array:
     """The visible share (n,) of an animal that is partly behind a nearer object.
 
@@ -421,7 +401,8 @@ def to_track(
     objects = np.isfinite(observed.objects[..., 0]).sum(axis=1)
     n_animals = np.clip(objects, observed.known.any(axis=1), subject.n_animals)
     track.n_animals[:] = n_animals[due]
-    strayed = doubted(subject, observed, path, in_view, usual_px, n_animals)
+    # animals that touch are one object
+    strayed = doubted(subject, observed, path, in_view, np.maximum(n_animals, subject.n_animals))
     masks = measured & ~unknown, bridged, strayed
     some = (mask[due] for mask in masks)
     mask_and_flag(subject, track, observed[due], path[due], doubt[due], *some)
@@ -618,7 +599,6 @@ def doubted(
     observed: Observations,
     path: NDArray[np.int64],
     in_view: Array,
-    usual_px: float,
     n_animals: NDArray[np.int64],
 ) -> NDArray[np.bool_]:
     """Whether (n,) a pose is doubtful because of its depth image.
@@ -631,10 +611,7 @@ def doubted(
         observed: hypotheses (n, H).
         path: (n,) hypothesis of each frame, `NONE` if it was skipped.
         in_view: (n,) visible share of the animal.
-        usual_px: its usual number of pixels.
         n_animals: (n,) animals in view.
     """
-    found = contradicted(observed, path, subject.length_mm) | (in_view < WHOLE)
-    if subject.n_animals > subject.n_measured:
-        found |= together(observed, path, usual_px) | (n_animals > subject.n_measured)
-    return found
+    contradicts = contradicted(observed, path, subject.length_mm)
+    return contradicts | (in_view < WHOLE) | (n_animals > subject.n_measured)

@@ -308,16 +308,8 @@ def test_spans_are_the_stretches_of_true():
 
 
 @pytest.mark.parametrize("n_animals", [1, 2])
-def test_while_two_animals_touch_no_pose_is_trusted_live_as_over_the_whole(measured, n_animals):
-    subject = replace(SUBJECT, n_animals=n_animals)
-    seen = told(SECONDS, measured)
-    seen.n_px[60:66, :2] = 1500  # both are one thing
-    online = OnlineTracker(subject, 6)
-    parts = [online.add(seen[k : k + 10]) for k in range(0, len(seen), 10)]
-    rows = [part for part in (*parts, online.close()) if part is not None]
-    for flag in (
-        track_whole(subject, seen).track.flag,
-        np.concatenate([part.flag for part in rows]),
-    ):
-        touching = (flag != "")[60:66]
-        assert touching.all() if n_animals == 2 else not touching.any()
+def test_live_no_pose_of_one_of_two_animals_is_trusted(measured, n_animals):
+    online = OnlineTracker(replace(SUBJECT, n_animals=n_animals))
+    row = online.add(told(SECONDS, measured)[:30])
+    assert row is not None
+    assert ((row.flag != "") == (n_animals == 2)).all()

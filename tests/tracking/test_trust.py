@@ -15,7 +15,6 @@ from liex_lab.tracking.trust import (
     head_tail_weight,
     lies_unknown,
     share_in_view,
-    together,
     usual_pixels,
 )
 from tests.tracking.stories import MOUSE, SUBJECT, joint_error, lose, noisy, told, walk
@@ -120,15 +119,6 @@ def test_an_error_of_a_quarter_of_the_length_is_not_trusted_whatever_the_plan_sa
     seen.error_mm[:] = 0.5 * MOUSE.length
     lenient = replace(SUBJECT, doubtful_mm=1000.0)
     assert (track_whole(lenient, seen).track.flag == "doubtful").mean() > 0.5
-
-
-def test_two_animals_that_touch_are_one_thing_of_more_pixels_than_one_usually_shows():
-    seen = told(np.arange(6) / 30.0, walk(np.arange(6) / 30.0))
-    seen.n_px[:, :2] = np.array([800, 820, 1500, 1290, 400, 1500])[:, None]
-    path = np.array([0, 1, 0, 0, 0, -1])
-    np.testing.assert_array_equal(
-        together(seen, path, 800.0), [False, False, True, True, False, False]
-    )
 
 
 def test_what_an_animal_usually_shows_is_told_by_frames_with_nothing_before_it(
