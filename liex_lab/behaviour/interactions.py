@@ -15,9 +15,9 @@ Frames in which it is not clear which of them is which count for mutual words on
 direction. Sources: Live Mouse Tracker (de Chaumont et al. 2019, Nature Biomedical Engineering
 3:930) and deepof (Bordes et al. 2023, Nature Communications 14:4319).
 
-An animal that another one lies over has no pose, but their outline tells it from one that is merely
-hidden: its area lacks part of an animal, the volume below it does not, as the upper one is raised.
-The agent of such a mount is the animal that was behind when both were last measured.
+An animal that another one lies over has no pose, but their outline distinguishes it from one that
+is merely hidden: its area lacks part of an animal, the volume below it does not, as the upper one
+is raised. The agent of such a mount was behind the other in most of the time before it.
 """
 
 from __future__ import annotations
@@ -649,7 +649,7 @@ def _totals(arena: _Arena, found: Sequence[_Event], names: Sequence[str]) -> pd.
             observed = arena.observed(*both, mutual=one.mutual)
             either = ((agent, target), (target, agent)) if one.mutual else ((agent, target),)
             own = [event for event in found if event.word == word and event[:2] in either]
-            for event in own:  # mounts are seen without both poses
+            for event in own:  # mounts are found without both poses
                 observed[event.start : event.stop] = True
             observed_s = float(hold[observed].sum())
             first_s = float(arena.time_s[observed][0]) if observed.any() else np.nan

@@ -12,7 +12,7 @@ The best explanation is then improved alternately: every pixel goes to the body 
 nearest to it in depth, or in the image where none is rendered, and each body is measured again on
 its own pixels (hard expectation maximisation). A component that one body explains as well is one
 animal, and one that a body high above the floor explains better than two is an animal on top of
-another one, of which little is seen. Only components of several animals pay for all this.
+another one, of which little is in view. Only components of several animals pay for all this.
 """
 
 from __future__ import annotations
