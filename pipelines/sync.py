@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from liex_lab.errors import SessionError
 from liex_lab.exchange.clocks import Alignment, align, align_pairs, check_times
 from liex_lab.exchange.pulses import read_pulses, rises
+from liex_lab.plan import Plan
+from liex_lab.recordings.recording import Recording
 from liex_lab.runtime import text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
@@ -32,6 +34,7 @@ def sync_session(
     channel: str = "",
     pulses: str | Path | None = None,
     patch: Patch | None = None,
+    infrared: str | None = None,
     pairs: str | Path | None = None,
     first: bool = False,
     events: str | Path | None = None,
@@ -55,6 +58,8 @@ def sync_session(
         patch: columns and rows (left, top, right, bottom) px of a part of the depth image in which
             an event lowers the mean depth, as an LED that blinds the camera does (unread is 0), or
             a flag; of the images as recorded, and the recording is read.
+        infrared: topic of the recording with 16-bit infrared images, in which the patch is sought
+            instead, and an event raises its mean; None for depth.
         pairs: table of moments known on both clocks, columns time_s and other_s.
         first: whether the first events of both sides are the same.
         events: table of events of the other instrument, columns event and time_s (on its clock, s);
@@ -81,7 +86,7 @@ def sync_session(
         own_s = stated[:, 0]
     else:
         time_s = frames["time_s"].to_numpy(float)
-        own_s, source = _own_events(raw, time_s, first_ns, pulses, patch, progress)
+        own_s, source = _own_events(raw, time_s, first_ns, pulses, patch, infrared, progress)
         own_s = check_times(own_s, source)
         other_s = check_times(read_pulses(other, channel), str(other))
         if first:
@@ -123,21 +128,29 @@ def _own_events(
     first_ns: int,
     pulses: str | Path | None,
     patch: Patch | None,
+    infrared: str | None,
     progress: Progress,
 ) -> tuple[Array, str]:
     """Events on the session's clock, s since the first frame, and their source."""
     if pulses is not None:
         return read_pulses(pulses), Path(pulses).name
     if patch is None:
+        if infrared is not None:
+            raise SessionError("of infrared images the mean of a patch counts; state it (--patch)")
         return time_s, "one event per frame"
+
+    def opened(where: str, plan: Plan, told: Progress) -> Recording:
+        stated = plan if infrared is None else plan.with_settings([f"recording.topic={infrared}"])
+        return open_planned(where, stated, told)
+
     left, top, right, bottom = patch
     stamps_ns: list[int] = []
     means: list[float] = []
-    with recording_of(session, None, progress, open_planned) as images:
+    with recording_of(session, None, progress, opened) as images:
         height, width = images.camera.height, images.camera.width
         if not (0 <= left < right <= width and 0 <= top < bottom <= height):
             raise SessionError(
-                f"a patch is LEFT,TOP,RIGHT,BOTTOM in pixels of the depth image of {width} x "
+                f"a patch is LEFT,TOP,RIGHT,BOTTOM in pixels of the image of {width} x "
                 f"{height}; got {','.join(map(str, patch))}"
             )
         for frames in images.chunks(32):
@@ -145,7 +158,7 @@ def _own_events(
             means += [float(frame.depth[top:bottom, left:right].mean()) for frame in frames]
             progress(len(means), len(images), "reading the patch")
     times = (np.array(stamps_ns) - first_ns) * 1e-9
-    rows = np.flatnonzero(rises(-np.array(means)))
+    rows = np.flatnonzero(rises(np.array(means) * (-1 if infrared is None else 1)))
     # the event was between two frames
     return 0.5 * (times[rows - 1] + times[rows]), f"pixels {','.join(map(str, patch))}"
 

@@ -281,6 +281,15 @@ def sync(
             help="Pixels of the recorded depth image whose mean falls at each pulse, as by an LED.",
         ),
     ] = None,
+    infrared: Annotated[
+        str | None,
+        typer.Option(
+            "--infrared",
+            metavar="TOPIC",
+            help="Topic of 16-bit infrared images in the recording: the patch is sought there, and "
+            "its mean rises.",
+        ),
+    ] = None,
     pairs: Annotated[
         Path | None,
         typer.Option(
@@ -312,6 +321,7 @@ def sync(
             channel=channel,
             pulses=pulses,
             patch=(left, top, right, bottom) if patch else None,
+            infrared=infrared,
             pairs=pairs,
             first=first,
             events=events,

@@ -185,3 +185,23 @@ def test_a_blinking_patch_of_the_recording_gives_the_pulses(
     np.testing.assert_allclose(frames["sync_s"], other_clock(frames["time_s"]), atol=0.015)
     with pytest.raises(SessionError, match=r"LEFT,TOP,RIGHT,BOTTOM in pixels .* of 107 x 80"):
         sync_session(session.path, tmp_path / "ephys.npy", patch=(2, 1, 200, 7))
+
+    def infrared(where: str, plan: Plan, _: Any) -> Recording:
+        assert (where, plan.recording.topic) == ("night.mcap", "/ir/image_raw")
+        return Recording(  # bright where depth is unread
+            name="circle",
+            format="mcap",
+            camera=MOUSE.camera,
+            times_ns=MOUSE.times_ns,
+            read=lambda row: 900.0 - read(row),
+        )
+
+    monkeypatch.setattr(sync, "open_planned", infrared)
+    plan = Plan.from_toml(session.plan, "plan.toml")
+    monkeypatch.setattr(sync, "recording_of", lambda *_: _[3]("night.mcap", plan, None))
+    found = sync_session(
+        session.path, tmp_path / "ephys.npy", patch=(2, 1, 10, 7), infrared="/ir/image_raw"
+    )
+    assert (found.own_ns, found.other_s) == (fit.own_ns, fit.other_s)
+    with pytest.raises(SessionError, match="state it"):
+        sync_session(session.path, tmp_path / "ephys.npy", infrared="/ir/image_raw")
