@@ -193,7 +193,7 @@ def test_a_blinking_patch_of_the_recording_gives_the_pulses(
             format="mcap",
             camera=MOUSE.camera,
             times_ns=MOUSE.times_ns,
-            read=lambda row: 900.0 - read(row),
+            read=lambda row: np.asarray(900.0 - read(row), np.float32),
         )
 
     monkeypatch.setattr(sync, "open_planned", infrared)
