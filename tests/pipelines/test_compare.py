@@ -299,7 +299,7 @@ def test_statistics_per_animal_are_refused_where_animals_may_have_been_exchanged
     mixed = table.assign(group=["a", "b"] * 4)
     of_animal, of_arena = cohort.compare(mixed, measures).to_dict("records")
     assert of_animal["unit"] == "animal"  # within the arenas, as blocks
-    assert "of the arena and the same for all its animals" in of_arena["refused"]
+    assert "of the arena is the same for all its animals" in of_arena["refused"]
     two = table.assign(cage=[f"c{k % 2}" for k in range(8)])
     kept, notes = cohort.unified(two)
     assert kept["cage"].equals(table["arena"])
