@@ -104,9 +104,11 @@ class Verdict:
                 "are measured and trusted"
             )
         notes = list(cautions)
-        if 0 < tracked.n_animals < n_measured:
+        n_fewer = int((track.n_animals < n_measured).sum())
+        if n_measured > 1 and n_fewer > 0.05 * track.n_frames:
             notes.append(
-                f"animal.count is {n_measured}, but {tracked.n_animals} stand apart at once"
+                f"animal.count is {n_measured}, and in {n_fewer} of {track.n_frames} frames fewer "
+                "are counted: one may be hidden or away"
             )
         if n_hidden:
             notes.append(f"the animal is hidden in {n_hidden:,} frames")

@@ -248,7 +248,7 @@ def doubt(crossings: Sequence[Crossing]) -> str:
     certain = float(np.prod([1.0 - one.p_swap for one in crossings]))
     if certain >= CERTAIN:
         return ""
-    n = sum(one.p_swap > UNCLEAR for one in crossings)
+    n = sum(one.p_swap > (1.0 - CERTAIN) / len(crossings) for one in crossings)
     return (
         f"the animals may have been exchanged at {n} of {len(crossings)} crossings: that this is "
         f"the same animal throughout is {certain:.0%} certain, too little for statistics per animal"
