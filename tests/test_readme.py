@@ -32,7 +32,7 @@ PAGES = {  # as people wrote them
 }
 EVERYTHING = "\n".join([README, *PAGES.values()])
 
-OTHERS = {"height_ave_mm", "velocity_2d_mm", "area_mm"}  # MoSeq's columns
+OTHERS = {"height_ave_mm", "velocity_2d_mm", "area_mm", "dist_to_center_px"}  # MoSeq's columns
 SCENE = {field.name for kind in (Scene, Fixture, SensorCard) for field in fields(kind)}
 
 
