@@ -1,19 +1,26 @@
 """A stream of skeletons: what is in it, and what is said where no window can be shown."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
 from liex_lab import api, cli
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
+from liex_lab.geometry import SE3
+from liex_lab.optics.camera import KINECT_V2
 from liex_lab.plan import Plan
+from liex_lab.recordings.frame import DepthFrame
 from liex_lab.sessions import viewer
-from liex_lab.sessions.rrd import SKELETON
+from liex_lab.sessions.rrd import ANIMALS, SKELETON
 from liex_lab.sessions.rrd_scene import DEPTH, IMAGE
 from liex_lab.sessions.viewer import ERROR
+from liex_lab.tracking.track import Track
 
 SOURCE = "synthetic:walk?seed=3&frames=30&sensor=primesense-qvga&spine_mm=70"
 SET = ["--set", "animal.spine_mm=70"]
@@ -44,6 +51,21 @@ def test_every_skeleton_has_its_error_and_every_fifth_frame_its_picture(
     assert len(bones) >= len(errors) >= 24
     assert [row["frame"] for row in pictures] == list(range(0, 30, 5))
     assert _rows(followed[0], IMAGE)
+
+
+def test_each_of_two_animals_has_a_skeleton_a_name_and_an_error(tmp_path: Path) -> None:
+    file = tmp_path / "pair.rrd"
+    skeleton = Skeleton.load("mouse")
+    view = viewer.LiveView(
+        "pair", KINECT_V2, SE3.identity(), skeleton, str(file), None, ("animal1", "animal2")
+    )
+    row = Track.empty(skeleton, np.zeros(1, np.int64))
+    posed = replace(row, joints_mm=np.ones((1, 5, 3)), predicted_error_mm=np.array([2.0]))
+    view.show(DepthFrame(0, 0, np.full((424, 512), 700.0, np.float32)), [row, posed])
+    view.close()
+    assert not [one for one in _rows(file, ERROR) if one.get("frame") is not None]
+    for entity in (f"{SKELETON}/bones", f"{ANIMALS}/animal2/bones", f"{ERROR}/animal2"):
+        assert [one["frame"] for one in _rows(file, entity) if "frame" in one] == [0]
 
 
 def test_the_stream_brings_its_layout(followed: tuple[Path, str]) -> None:
