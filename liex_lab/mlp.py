@@ -17,6 +17,7 @@ from liex_lab.runtime.processes import serial_products
 
 Array = NDArray[np.float64]
 
+_AT_ONCE = 2048  # samples in memory
 LIMIT = 6.0  # standard deviations at which features are clipped
 
 
@@ -50,13 +51,17 @@ class Network:
         Returns:
             (m, K) logits.
         """
-        x = np.clip((features - self.centre) / self.scale, -LIMIT, LIMIT)
+        found = []
         with serial_products():
-            for k, (weights, bias) in enumerate(self.layers):
-                x = x @ weights + bias
-                if k + 1 < len(self.layers):
-                    x = np.maximum(x, 0.0)
-        return x.astype(np.float64)
+            for begin in range(0, max(1, len(features)), _AT_ONCE):
+                some = features[begin : begin + _AT_ONCE]
+                x = np.clip((some - self.centre) / self.scale, -LIMIT, LIMIT)
+                for k, (weights, bias) in enumerate(self.layers):
+                    x = x @ weights + bias
+                    if k + 1 < len(self.layers):
+                        x = np.maximum(x, 0.0)
+                found.append(x)
+        return np.concatenate(found, dtype=np.float64)
 
 
 def check_layers(network: Network, n_outputs: int) -> None:

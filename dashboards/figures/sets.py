@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from liex_lab.behaviour.cohort import SUBJECT
 from liex_lab.errors import SessionError
 from liex_lab.plan.study import references_first
-from liex_lab.runtime import durable, text_files
+from liex_lab.runtime import durable, memory, text_files
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.sessions import Session
 
@@ -285,6 +285,7 @@ def for_the_page(session: Session, folder: Path | None) -> dict[str, str]:
     paged = PAGES in asked or _PAGES_FILE in there
     with drawing(), _one_pdf(folder if paged else None) as pages:
         for name, what, figure in session_figures(session):
+            memory.release_memory()
             if figure is None:
                 continue
             svg = image_bytes(figure, "svg")

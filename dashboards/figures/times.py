@@ -114,27 +114,35 @@ def curves(
     """
     first_s, last_s = span_s or (0.0, animal.duration_s)
     error = animal.frames["predicted_error_mm"]
-    rows: list[tuple[str, str, Array, str, bool]] = []
+    time_s = animal.frames["time_s"].to_numpy(float)
+    near = slice(*np.searchsorted(time_s, [first_s - _BESIDE_S, last_s + _BESIDE_S]))
+    rows: list[tuple[str, str, Array, Array, str, float | None]] = []
+    n_known: list[int] = []
+
+    def add(title: str, unit: str, values: Array, colour: str, from_zero: bool) -> None:
+        """Keep what is drawn of a curve."""
+        kept = kept_rows(values[near], _MOST_COLUMNS)
+        low = float(np.nanmin(values, initial=0.0)) if from_zero else None
+        rows.append((title, unit, time_s[near][kept], values[near][kept], colour, low))
+        n_known.append(int(np.isfinite(values).sum()))
+
     for one in drawn_curves(animal):
         values, unit = shown(animal.column(one.column), one.unit)
-        rows.append((f"{one.title} {one.what}", unit, values, one.colour, one.from_zero))
+        add(f"{one.title} {one.what}", unit, values, one.colour, one.from_zero)
     if error.notna().any():
-        values = animal.broken(error)
-        rows.append(("Predicted error of a joint", "mm", values, PREDICTED_ERROR, True))
-    if not any(np.isfinite(values).any() for _, _, values, _, _ in rows):
+        add("Predicted error of a joint", "mm", animal.broken(error), PREDICTED_ERROR, True)
+    if not any(n_known):
         return None
-    n = int(error.notna().sum() or np.isfinite(rows[0][2]).sum())
+    n = int(error.notna().sum() or n_known[0])
     step = _CURVE_MM + 6.0
     figure = sheet(width_mm, len(rows) * step + 8.0)
     width = width_mm - LEFT_MM - RIGHT_MM
-    time_s = animal.frames["time_s"].to_numpy(float)
-    near = slice(*np.searchsorted(time_s, [first_s - _BESIDE_S, last_s + _BESIDE_S]))
     _, size = time_unit(last_s - first_s)
     rears = animal.bouts.loc[
         animal.bouts["action"].astype(str).str.startswith("rear"), ["start_s", "stop_s", "action"]
     ].to_numpy()
     colours = action_colours(animal.words)
-    for k, (title, unit, values, colour, from_zero) in enumerate(rows):
+    for k, (title, unit, at_s, values, colour, low) in enumerate(rows):
         axes = panel(figure, LEFT_MM, 8.0 + (len(rows) - 1 - k) * step, width, _CURVE_MM)
         if " height above the floor" in title and len(rears):
             title += "; rearing shaded"
@@ -149,15 +157,10 @@ def curves(
         axes.set_title(
             f"{title}, {animal.label}, n = {counted(n, 'frame')}" if k == 0 else title, size=6.5
         )
-        kept = kept_rows(values[near], _MOST_COLUMNS)
         # a marker for each value of a short stretch
-        marker = "" if span_s is None or len(kept) > 600 else "o"
-        axes.plot(
-            time_s[near][kept] / size, values[near][kept], color=colour, marker=marker, markersize=1
-        )
-        axes.set(
-            ylabel=unit, ylim=(float(np.nanmin(values, initial=0.0)) if from_zero else None, None)
-        )
+        marker = "" if span_s is None or len(values) > 600 else "o"
+        axes.plot(at_s / size, values, color=colour, marker=marker, markersize=1)
+        axes.set(ylabel=unit, ylim=(low, None))
         axes.grid(axis="y", color=LINE, linewidth=0.4)
         _clock(axes, (first_s, last_s), last=k == len(rows) - 1)
     return figure

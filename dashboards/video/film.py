@@ -32,6 +32,7 @@ from ..figures.animals import (
 )
 from ..figures.places import in_image
 
+_MOST_FRAMES = 120_000  # whose heights give the scale
 _PLAIN = 128  # neutral light
 _LIGHT = np.array([-0.5, -0.6])
 _WHITE = (255, 255, 255)
@@ -120,10 +121,14 @@ def scale_mm(sessions: Sequence[Session]) -> float:
 
     A tenth more than the joints' heights, so that the surface above them has colours.
     """
-    reached = [
-        1.1 * float(session.table("poses", ["z_mm"])["z_mm"].quantile(0.995))
-        for session in sessions
-    ]
+    reached = []
+    for session in sessions:
+        index = session.table("frames", ["frame_index"])["frame_index"]
+        # all frames of an hour, or every second one of two
+        some = (
+            index[:: -(-len(index) // _MOST_FRAMES)].tolist() if len(index) > _MOST_FRAMES else None
+        )
+        reached.append(1.1 * float(session.table("poses", ["z_mm"], some)["z_mm"].quantile(0.995)))
     known = [height for height in reached if np.isfinite(height)]
     return max(10.0 * float(np.ceil(max(known) / 10.0)), 20.0) if known else 80.0
 

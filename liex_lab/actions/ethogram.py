@@ -107,11 +107,11 @@ class Ethogram:
 
     @staticmethod
     def of_words(
-        words: Sequence[str] | NDArray[np.str_] | NDArray[np.int64],
+        words: Sequence[str] | NDArray[np.str_] | NDArray[np.signedinteger],
         times_ns: NDArray[np.int64],
         vocabulary: Mapping[str, str] | None = None,
         score: NDArray[np.float64] | None = None,
-        part: NDArray[np.int64] | None = None,
+        part: NDArray[np.signedinteger] | None = None,
         source: str = "model",
         names: Sequence[str] | None = None,
     ) -> "Ethogram":
@@ -129,7 +129,7 @@ class Ethogram:
         Returns:
             The ethogram; the score of a bout is the mean over its frames.
         """
-        label = np.asarray(words, np.str_ if names is None else np.int64)
+        label = np.asarray(words, np.str_) if names is None else np.asarray(words)
         n = len(label)
         if n == 0:
             return Ethogram((), vocabulary or {}, source)

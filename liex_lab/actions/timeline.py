@@ -28,7 +28,7 @@ from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
 from liex_lab.mlp import Network
 from liex_lab.recordings.timestamps import median_step
-from liex_lab.runtime.memory import Allocator, blocks, check_shapes
+from liex_lab.runtime.memory import Allocator, blocks, check_shapes, in_windows, release_pages
 from liex_lab.tracking.track import Track
 
 Array = NDArray[np.float64]
@@ -173,6 +173,7 @@ _PIECE = 16_384
 _SLACK = 1.25
 _STILL = 0.1
 _UNSEEN = 6.0
+_BOUTS = 256  # measured between two releases of memory
 
 
 @dataclass(frozen=True)
@@ -279,8 +280,8 @@ class TimelineModel:
         n = track.n_frames
         probability = allocate((n, len(self.words)), float)
         score = np.zeros(n)
-        code = np.full(n, self.words.index(UNLABELLED))
-        part = np.full(n, -1)
+        code = np.full(n, self.words.index(UNLABELLED), np.int32)
+        part = np.full(n, -1, np.int32)
         for rows in blocks(n, _PIECE):
             probability[rows] = np.nan
         time_s = (track.times_ns - track.times_ns[:1]) * 1e-9
@@ -326,8 +327,8 @@ class TimelineModel:
 
     def _unname(
         self,
-        code: NDArray[np.int64],
-        part: NDArray[np.int64],
+        code: NDArray[np.int32],
+        part: NDArray[np.int32],
         broken: Broken,
         refused: list[tuple[slice, int, str]],
     ) -> None:
@@ -366,6 +367,8 @@ class TimelineModel:
             slow = np.maximum.reduceat(speed, starts) < self.peaks[words] / _SLACK
             false = np.zeros(len(starts), bool)
             for k, (start, stop, word) in enumerate(zip(starts, stops, words, strict=True)):
+                if k % _BOUTS == 0:
+                    release_pages()  # of the columns that are measured
                 a, b = int(row[start]), int(row[stop])
                 if broken is None or word == nothing or a == b:
                     continue
@@ -494,9 +497,9 @@ def steady_speed(segment: Segment, names: Sequence[str]) -> Array:
     from scipy.ndimage import uniform_filter1d
 
     width = 2 * max(1, round(0.2 / (segment.times_s[1] - segment.times_s[0]))) + 1
-    return np.asarray(
-        uniform_filter1d(segment.values[:, names.index("speed")], width, mode="nearest")
-    )
+    at, values = names.index("speed"), segment.values
+    speed = in_windows(len(values), 0, lambda ticks: values[ticks, at])
+    return np.asarray(uniform_filter1d(speed, width, mode="nearest"))
 
 
 def gather(tracks: Sequence[LabelledTrack], words: Sequence[str], clock_hz: float) -> Examples:

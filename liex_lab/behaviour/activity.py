@@ -22,6 +22,7 @@ from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.days import Light
 from liex_lab.behaviour.kinematics import segments
 from liex_lab.behaviour.statistics import false_discovery
+from liex_lab.runtime.memory import blocks
 from liex_lab.scene.scene import UNKNOWN, Arena
 from liex_lab.scene.zones import SEPARATOR
 from liex_lab.tables.rows import stop_times
@@ -31,6 +32,7 @@ Array = NDArray[np.float64]
 
 BIN_S = 60.0
 FEWEST = 10  # bins, of a shorter recording
+_BLOCK = 1 << 17  # frames in memory at once
 
 
 def activity(
@@ -421,12 +423,9 @@ def inside_zones(frames: pd.DataFrame, zones: Sequence[str]) -> list[Mask]:
     """
     if not zones:  # sessions of older versions have no such column
         return []
-    words = pd.Series(frames["zone"].astype(str))
-    different = {text: set(text.split(SEPARATOR)) for text in words.unique()}
-    return [
-        words.map({text: zone in names for text, names in different.items()}).to_numpy(bool)
-        for zone in zones
-    ]
+    words = frames["zone"].astype("category").cat
+    names = [set(text.split(SEPARATOR)) for text in words.categories]
+    return [np.array([zone in one for one in names])[words.codes] for zone in zones]
 
 
 def outer_margin_mm(arena: Arena) -> float:
@@ -563,17 +562,20 @@ def occupancy(
 
     xy = np.asarray(xy_mm, float)
     known = np.isfinite(xy).all(axis=1)
-    xy = xy[known]
-    hold = np.asarray(hold_s, float)[known]
-    low = np.min([np.asarray(low_mm, float), *([xy.min(axis=0)] if len(xy) else [])], axis=0)
-    high = np.max([np.asarray(high_mm, float), *([xy.max(axis=0)] if len(xy) else [])], axis=0)
+    hold = np.asarray(hold_s, float)
+    low = np.fmin(np.asarray(low_mm, float), np.fmin.reduce(xy, initial=np.inf))
+    high = np.fmax(np.asarray(high_mm, float), np.fmax.reduce(xy, initial=-np.inf))
     # along a side; larger floors have larger cells
     cell = max(5.0, float((high - low).max()) / 400)
     edges = [
         a + cell * np.arange(max(int(np.ceil((b - a) / cell)), 1) + 1)
         for a, b in zip(low, high, strict=True)
     ]
-    counted, _, _ = np.histogram2d(xy[:, 1], xy[:, 0], [edges[1], edges[0]], weights=hold)
+    counted = np.zeros((len(edges[1]) - 1, len(edges[0]) - 1))
+    for rows in blocks(len(xy), _BLOCK):
+        some = known[rows]
+        x, y = xy[rows][some].T
+        counted += np.histogram2d(y, x, [edges[1], edges[0]], weights=hold[rows][some])[0]
     if sd_mm > 0:
         counted = gaussian_filter(counted, sd_mm / cell, mode="reflect")
-    return Occupancy(np.asarray(counted, float), edges[0], edges[1], len(xy))
+    return Occupancy(np.asarray(counted, float), edges[0], edges[1], int(known.sum()))

@@ -23,7 +23,7 @@ from liex_lab.actions.vocabulary import limits_of, printed_meanings
 from liex_lab.behaviour.body import STANDS, SWIMS, kind_of
 from liex_lab.behaviour.kinematics import Joints, kinematics, segments, smallest_turn
 from liex_lab.plan.sections import BehaviourThresholds
-from liex_lab.runtime.memory import Allocator
+from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, median_step, stop_times
 from liex_lab.tables.schema import BOUTS, table_columns, to_pandas
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 
 Array = NDArray[np.float64]
+_BOUTS = 256  # measured at once
 # between the curvatures of two thirds of the body, for a wave to be accepted
 
 
@@ -52,7 +53,6 @@ class BoutReader:
         self.hold_s = stop_times(self.time_s) - self.time_s
         step = median_step(self.time_s)
         self.fps = 1.0 / step if step > 0 else 0.0
-        self.position = kinematics[["x_mm", "y_mm", "z_mm"]].to_numpy(float)
         self.kind = kind_of(kinematics)
         self._columns = {
             str(name): values.to_numpy(float)
@@ -116,7 +116,7 @@ class BoutReader:
             bouts: the table `bouts`, in order of time.
             spans: the rows of the n bouts, see `rows_of`.
         """
-        number = segments(self.time_s, np.isfinite(self.position[:, 0]))
+        number = segments(self.time_s, np.isfinite(self._columns["x_mm"]))
         start, stop = np.array(spans, np.int64).reshape(-1, 2).T
         ends = {"action": bouts["action"].to_numpy(), "stop_s": bouts["stop_s"].to_numpy(float)}
         last = pd.DataFrame({**ends, "number": number[stop - 1]}).groupby("action").shift()
@@ -138,12 +138,9 @@ class BoutReader:
         known = np.flatnonzero(np.isfinite(speed))
         path = float(np.nansum(step))
         timed = float(self.hold_s[start:stop][known].sum())
-        observed = start + np.flatnonzero(np.isfinite(self.position[start:stop, 0]))
-        displacement = (
-            self.position[observed[-1]] - self.position[observed[0]]
-            if len(observed)
-            else np.full(3, np.nan)
-        )
+        place = np.stack([self.column(f"{axis}_mm", start, stop) for axis in "xyz"], axis=1)
+        observed = place[np.isfinite(place[:, 0])]
+        displacement = observed[-1] - observed[0] if len(observed) else np.full(3, np.nan)
         top = _top(speed)
         return {
             "path_mm": path,
@@ -348,20 +345,19 @@ def measure_bouts(
     columns = table_columns("bouts", kind_of(kinematics))
     reader = BoutReader(kinematics, meanings)
     spans = reader.rows_of(bouts)
-    measured = [reader.measure(a, b) for a, b in spans]
     block: dict[str, Any] = {c.name: bouts[c.name].to_numpy() for c in BOUTS}
-    for column in columns[len(BOUTS) :]:
-        if column.name == "since_last_s":
-            block[column.name] = reader.since_last(bouts, spans)
-        elif column.name == "contradicts":
-            block[column.name] = [
-                reader.broken(a, b, str(word))
-                for (a, b), word in zip(spans, bouts["action"], strict=True)
-            ]
-        else:
-            known = reader.fps >= (column.unreliable_below_fps or 0.0)
-            empty = 0 if column.dtype == "int64" else np.nan
-            block[column.name] = [m[column.name] if known else empty for m in measured]
+    own = {c.name: c for c in columns[len(BOUTS) :]}
+    del own["since_last_s"]
+    block |= {name: [] for name in own}
+    for rows in blocks(len(spans), _BOUTS):
+        for (a, b), word in zip(spans[rows], bouts["action"].iloc[rows], strict=True):
+            measured: dict[str, Any] = reader.measure(a, b)
+            measured["contradicts"] = reader.broken(a, b, str(word))
+            for name, column in own.items():
+                known = reader.fps >= (column.unreliable_below_fps or 0.0)
+                empty = 0 if column.dtype == "int64" else np.nan
+                block[name].append(measured[name] if known else empty)
+    block["since_last_s"] = reader.since_last(bouts, spans)
     return to_pandas(columns, block)
 
 

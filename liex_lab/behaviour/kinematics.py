@@ -27,7 +27,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS, BodyAxis
-from liex_lab.runtime.memory import Allocator, blocks
+from liex_lab.runtime.memory import Allocator, blocks, in_windows, put
 from liex_lab.tables.rows import constant_runs, gap_follows, median_step, stop_times
 from liex_lab.tables.schema import table_columns, to_pandas
 from liex_lab.tracking.track import Track
@@ -246,6 +246,7 @@ IMPOSSIBLE_MM_S = 3000.0  # faster than any mouse: a tracking error
 # correlation time of errors; on rendered recordings it is longer, smoothed or not
 ERROR_LASTS_S = 0.3
 _BLOCK = 16_384  # frames in memory at a time
+_AROUND = 4096  # frames on either side that hold the half window at any camera's rate
 
 
 @dataclass(frozen=True)
@@ -363,11 +364,16 @@ def measures(
     body = BodyAxis.of(joints.names, joints.parents)
     shape: dict[str, Array] = {}
     for rows in blocks(joints.n_frames, _BLOCK):
-        _put(shape, rows, posture(body, *joints.at(rows)), joints.n_frames, allocate)
+        put(shape, rows, posture(body, *joints.at(rows)), joints.n_frames, allocate)
     begins = np.zeros(len(time_s), np.bool_) if begins is None else begins
     observed = np.isfinite(shape["centre"][:, 0])
-    before, after = neighbours(time_s, observed, half_window_s, begins)
-    span_s = np.where(after > before, time_s[after] - time_s[before], np.nan)
+    before, after = neighbours(time_s, observed, half_window_s, begins, allocate)
+    span_s = in_windows(
+        len(time_s),
+        0,
+        lambda at: np.where(after[at] > before[at], time_s[after[at]] - time_s[before[at]], np.nan),
+        allocate,
+    )
     spans = Spans(before, after, span_s, slice(None))
     hold_s = stop_times(time_s) - time_s
     found = shape | _moving(shape, body.kind, spans, hold_s, impossible_above_mm_s, allocate)
@@ -377,20 +383,6 @@ def measures(
         found |= tail_beat(shape, time_s, number, median_step(time_s))
         found["below_surface_mm"] = surface - shape["centre"][:, 2]
     return found
-
-
-def _put(
-    columns: dict[str, Array],
-    rows: slice,
-    values: dict[str, Array],
-    n: int,
-    allocate: Allocator,
-) -> None:
-    """Write values (m, ...) of some rows into their columns (n, ...), allocated on first use."""
-    for name, some in values.items():
-        if name not in columns:
-            columns[name] = allocate((n, *some.shape[1:]), float)
-        columns[name][rows] = some
 
 
 def _moving(
@@ -422,7 +414,7 @@ def _moving(
             "heading_rad": np.where(flat, shape["heading_rad"][rows], np.nan),
             "heading_sd_rad": np.where(flat, shape["heading_sd_rad"][rows], np.nan),
         }
-        _put(columns, rows, values, len(hold_s), allocate)
+        put(columns, rows, values, len(hold_s), allocate)
     for rows in blocks(len(hold_s), _BLOCK):  # needs the neighbours' values
         here = spans[rows]
         values = {
@@ -431,7 +423,7 @@ def _moving(
             "yaw_rate_rad_s": here.turning(columns["heading_rad"]),
             "yaw_rate_sd_rad_s": here.sd(columns["heading_sd_rad"]),
         }
-        _put(columns, rows, values, len(hold_s), allocate)
+        put(columns, rows, values, len(hold_s), allocate)
     return columns
 
 
@@ -527,6 +519,7 @@ def neighbours(
     observed: NDArray[np.bool_],
     half_window_s: float = HALF_WINDOW_S,
     begins: NDArray[np.bool_] | bool = False,
+    allocate: Allocator = np.empty,
 ) -> tuple[Rows, Rows]:
     """Rows to difference between: about `half_window_s` before and after, within the same stretch.
 
@@ -539,24 +532,30 @@ def neighbours(
         half_window_s: distance of the neighbours before and after the frame, s; at the camera's own
             rate the next frame is used, despite jitter of the clock.
         begins: (n,) bool, see `segments`.
+        allocate: allocator of the result.
 
     Returns:
         before and after, (n,) int64 rows each.
     """
-    n = len(time_s)
-    rows = np.arange(len(time_s))
-    reach = (
-        0.75 * half_window_s
-    )  # at the camera's own rate the next frame is used, despite jitter of its clock
-    before = np.searchsorted(time_s, time_s - reach, side="right") - 1
-    after = np.searchsorted(time_s, time_s + reach, side="left")
     number = segments(time_s, observed, begins)
-    first = np.searchsorted(number, number, side="left")
-    last = np.searchsorted(number, number, side="right") - 1
-    before = np.clip(np.minimum(before, np.maximum(rows - 1, 0)), first, last)
-    after = np.clip(np.maximum(after, np.minimum(rows + 1, n - 1)), first, last)
-    lost = ~observed
-    return np.where(lost, rows, before), np.where(lost, rows, after)
+    # at the camera's own rate the next frame is used, despite jitter of its clock
+    reach = 0.75 * half_window_s
+
+    def near(window: slice) -> Rows:
+        """The two rows (m, 2) of some frames."""
+        time, stretch = time_s[window], number[window]
+        rows = np.arange(len(time))
+        before = np.searchsorted(time, time - reach, side="right") - 1
+        after = np.searchsorted(time, time + reach, side="left")
+        first = np.searchsorted(stretch, stretch, side="left")
+        last = np.searchsorted(stretch, stretch, side="right") - 1
+        before = np.clip(np.minimum(before, np.maximum(rows - 1, 0)), first, last)
+        after = np.clip(np.maximum(after, np.minimum(rows + 1, len(rows) - 1)), first, last)
+        found = np.where(observed[window], [before, after], rows)
+        return np.asarray(window.start + found.T)
+
+    before, after = in_windows(len(time_s), _AROUND, near, allocate).T
+    return before, after
 
 
 def smallest_turn(angle: Array) -> Array:

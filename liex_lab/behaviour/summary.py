@@ -211,17 +211,7 @@ def kinematics_of_rows(
         around: the water's surface and the seams.
         allocate: makes the arrays of the table (an allocator, as `np.empty`).
     """
-    times_ns = rows.track.times_ns
-    frames = pd.DataFrame(  # only what is needed
-        {
-            "session_id": rows.session_id,
-            "individual": rows.individual,
-            "frame_index": rows.frame_index,
-            "time_s": rows.time_s,
-            "dt_s": np.append(np.nan, np.diff(times_ns) * 1e-9)[: len(times_ns)],
-        }
-    )
-    return moving(frames, Joints.of_track(rows.track), rules, around, allocate)
+    return moving(rows.frames_table, Joints.of_track(rows.track), rules, around, allocate)
 
 
 def stated_by(session: SessionTables) -> tuple[MouseRules, Surroundings]:

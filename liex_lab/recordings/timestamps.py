@@ -16,6 +16,8 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
+from liex_lab.runtime.memory import in_windows
+
 Times = NDArray[np.int64]
 
 GAP_FACTOR = 1.5  # a step longer than this many median steps means that frames are missing
@@ -130,7 +132,9 @@ def rounded_step(times_ns: Times) -> int:
         # of coarse clocks, near a camera's step
         rounded = unit <= usual / 2 or unit in (1_000_000, 15_625_000)
     else:
-        off = np.abs(dt / usual - np.rint(dt / usual)) > 0.1
+        off = in_windows(
+            len(dt), 0, lambda at: np.abs(dt[at] / usual - np.rint(dt[at] / usual)) > 0.1
+        )
         rounded = bool(off.mean() > _OFTEN)
     if not rounded:
         return 0
@@ -169,6 +173,15 @@ def _in_phase(times_ns: Times, step_ns: float, window: int) -> Times:
     A stamp is off by up to half its rounding unit. The clock's phase, the circular mean over
     `window` frames before and after a step, is not, and corrects for the rounding.
     """
+    return in_windows(
+        len(times_ns) - 1,
+        window + 1,
+        lambda steps: _in_phase_within(times_ns[steps.start : steps.stop + 1], step_ns, window),
+    )
+
+
+def _in_phase_within(times_ns: Times, step_ns: float, window: int) -> Times:
+    """`_in_phase` of few stamps."""
     phase = (times_ns - times_ns[0]) / step_ns
     apart = np.diff(phase)
     stretch = np.append(0, np.cumsum(apart > _FAR))
@@ -194,13 +207,12 @@ def frames_apart(times_ns: Times, step_ns: int) -> Times:
     dt = np.diff(times_ns)
     if rounded_step(times_ns):
         return _in_phase(times_ns, step_ns, 16)
-    if not (dt > GAP_FACTOR * step_ns).any():
-        return np.ones(len(dt), np.int64)
     # the median of jittering steps is off by 1 %, which is refined with longer and longer gaps
     period = float(step_ns)
-    for longest in (1, *_LONGER):
-        missing = np.maximum(2, np.rint(dt / period))
-        apart = np.where(dt > GAP_FACTOR * step_ns, missing, 1).astype(np.int64)
+    long = dt > GAP_FACTOR * step_ns
+    apart = np.ones(len(dt), np.int64)
+    for longest in (1, *_LONGER) if long.any() else ():
+        apart[long] = np.maximum(2, np.rint(dt[long] / period))
         period = _slope(dt, apart, longest, period)
     return apart
 

@@ -14,7 +14,7 @@ import tempfile
 import threading
 import weakref
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, ClassVar, Self
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from liex_lab.errors import LiexError
 
 _ZEROS = 1 << 20  # bytes written at once
+_WINDOW = 1 << 16  # rows of a block
 # memory maps of all arrays on disk in use, and their lock
 _maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 _lock = threading.Lock()
@@ -57,7 +58,7 @@ def release_memory() -> None:
     Otherwise glibc keeps the gaps between arrays in use, and Arrow keeps the memory of tables;
     after hours of recording this is a lot.
     """
-    _release_pages()
+    release_pages()
     if "pyarrow" in sys.modules:
         sys.modules["pyarrow"].default_memory_pool().release_unused()
     if sys.platform == "linux":
@@ -114,7 +115,7 @@ def mapped(path: Path, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def _registered(array: NDArray[Any]) -> NDArray[Any]:
-    """A plain array of a memory map, registered for `_release_pages`."""
+    """A plain array of a memory map, registered for `release_pages`."""
     base: Any = array
     while not isinstance(base, mmap.mmap):
         base = base.base
@@ -123,7 +124,7 @@ def _registered(array: NDArray[Any]) -> NDArray[Any]:
     return array.view(np.ndarray)
 
 
-def _release_pages() -> None:
+def release_pages() -> None:
     """Release the pages of all arrays on disk; they are read again on access."""
     if sys.platform != "linux":
         return
@@ -155,9 +156,47 @@ def blocks(n: int, size: int) -> Iterator[slice]:
     """
     for start in range(0, n, size):
         yield slice(start, min(start + size, n))
-        _release_pages()
+        release_pages()
     if n > size:
         release_memory()
+
+
+def put(
+    columns: dict[str, NDArray[Any]],
+    rows: slice,
+    values: Mapping[str, NDArray[Any]],
+    n: int,
+    allocate: Allocator,
+) -> None:
+    """Write values (m, ...) of some rows into their columns (n, ...), allocated on first use."""
+    for name, some in values.items():
+        if name not in columns:
+            columns[name] = allocate((n, *some.shape[1:]), some.dtype)
+        columns[name][rows] = some
+
+
+def in_windows(
+    n: int, margin: int, compute: Callable[[slice], NDArray[Any]], allocate: Allocator = np.empty
+) -> NDArray[Any]:
+    """Rows that depend on neighbouring ones, computed in blocks with a margin on either side.
+
+    Args:
+        n: number of rows.
+        margin: rows on either side that a row depends on.
+        compute: called with the window of a block; returns its rows (m, ...).
+        allocate: allocator of the result.
+
+    Returns:
+        (n, ...) the rows of all blocks.
+    """
+    out = None
+    for rows in blocks(n, _WINDOW):
+        first = max(0, rows.start - margin)
+        some = compute(slice(first, min(n, rows.stop + margin)))[rows.start - first :]
+        if out is None:
+            out = allocate((n, *some.shape[1:]), some.dtype)
+        out[rows] = some[: rows.stop - rows.start]
+    return compute(slice(0, 0)) if out is None else out
 
 
 # Size limits of a NumPy archive (.npz) of unknown origin, checked before it is unpacked.

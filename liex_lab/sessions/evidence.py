@@ -126,13 +126,13 @@ class Results:
 
     def counts(self) -> dict[str, Any]:
         """Counts of frames and of their flags: section `frames` of session.json."""
-        flags, counts = np.unique(self.rows.track.flag, return_counts=True)
+        counts = self.rows.frames_table["flag"].astype("category").value_counts()
         missing = self.rows.missing_before()
         row = self.session_row()
         return {
             "n_frames": row["n_frames"],
             "n_observed": row["n_frames_observed"],
-            "flags": {flag or "good": n for flag, n in zip(flags, counts.tolist(), strict=True)},
+            "flags": {flag or "good": int(n) for flag, n in sorted(counts.items())},
             "n_missing": int(missing.sum()),
             "n_gaps": int((missing > 0).sum()),
             "duration_s": float(stop_times(self.rows.time_s)[-1]),

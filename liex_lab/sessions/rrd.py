@@ -207,7 +207,10 @@ class ReplayWriter:
                 body_columns(track[part], carriers),
                 *(_other_columns(one, track.skeleton, part) for one in others),
                 () if candidates is None else _candidate_columns(candidates[part]),
-                ((curve, rr.Scalars.columns(scalars=curves[curve][part])) for curve in curves),
+                *(
+                    [(curve, rr.Scalars.columns(scalars=factor * values[part]))]
+                    for curve, (values, factor) in curves.items()
+                ),
             ):
                 self._send(entity, part, columns)
             self._flush()  # limits the memory of a long recording
@@ -336,16 +339,18 @@ class ReplayWriter:
         when = timeline(self._index[rows], self._elapsed[rows])
         self._stream.send_columns(entity, when, [*columns])
 
-    def _log_curves(self, rows: Rows, kinematics: pd.DataFrame) -> dict[str, Array]:
-        """Log the style of the curves over time; returns their values by entity."""
+    def _log_curves(self, rows: Rows, kinematics: pd.DataFrame) -> dict[str, tuple[Array, float]]:
+        """Log the style of the curves over time; returns values and their unit by entity."""
         error = rows.track.predicted_error_mm
-        drawn = [("error/predicted", "predicted error (mm)", vocabulary.PREDICTED_ERROR, error)]
+        label = "predicted error (mm)"
+        drawn = [("error/predicted", label, vocabulary.PREDICTED_ERROR, (error, 1.0))]
         skeleton = self._origin.skeleton
         for one in logged_of({"joints": skeleton.names, "bones": skeleton.edges}):
             if one.column in kinematics:
-                values, unit = shown(kinematics[one.column].to_numpy(float), one.unit)
+                factor, unit = shown(1.0, one.unit)
                 label = f"{one.title.lower()}{f' ({unit})' if unit else ''}"
-                drawn.append((one.entity, label, one.colour, values))
+                values = kinematics[one.column].to_numpy(float)
+                drawn.append((one.entity, label, one.colour, (values, factor)))
         for entity, label, colour, _ in drawn:
             style = rr.SeriesLines(names=label, colors=rgba([int(colour[1:], 16)]), widths=1.5)
             self._stream.log(entity, style, static=True)
@@ -431,11 +436,12 @@ class ReplayWriter:
         end = (int(rows.frame_index[-1]) + 1, float(stop[-1]))
         own = {word: int(at[1:], 16) for word, at in vocabulary.action_colours(words).items()}
         self._log_lane(ACTIONS, spans, own, end)
-        count = frame_count(rows.frame_index)
+        count, time_s = frame_count(rows.frame_index), rows.time_s
+        flags = rows.frames_table["flag"].cat
         marked = [
-            (count[a], count[b], rows.time_s[a], stop[b - 1], flag)
-            for a, b, flag in constant_runs(rows.track.flag)
-            if flag
+            (count[a], count[b], time_s[a], stop[b - 1], flag)
+            for a, b, number in constant_runs(flags.codes.to_numpy())
+            if (flag := flags.categories[number])
         ]
         self._log_lane(TRACKING, marked, _FLAG_COLOURS, end)
 

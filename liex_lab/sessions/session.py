@@ -70,6 +70,7 @@ FILES = {  # of a session, and whether every version writes it
     "replay.rbl": False,
     "foxglove.json": False,
 }
+_LONG = 1_000_000  # rows of a table that is kept on the disk instead of in memory
 PULSE = next(column for column in FRAMES if column.name == "pulse_index")
 
 
@@ -318,8 +319,8 @@ class Session:
     def narrowed(self, **wanted: Sequence[str]) -> Session:
         """The same session, with only some columns of the named tables in memory.
 
-        All columns of a long recording need much memory. Columns that a table does not have are
-        ignored.
+        All columns of a long recording need much memory; those of a very long one are on its disk.
+        Columns that a table does not have are ignored.
 
         Args:
             **wanted: table name to column names, as in `frames=["time_s", "flag"]`.
@@ -332,10 +333,18 @@ class Session:
             # with little else of a long table in memory
             with reading_from(path), pq.ParquetFile(path, pre_buffer=False) as file:
                 known = [column for column in columns if column in file.schema_arrow.names]
-                read = file.read(known, use_threads=False)
-                table = read.to_pandas(split_blocks=True, self_destruct=True, use_threads=False)
-                del read
-                memory.release_memory()
+                n = file.metadata.num_rows
+                allocate = memory.on_disk(path.parent) if n > _LONG else np.empty
+                made: dict[str, NDArray[Any]] = {}
+                begin = 0
+                for k in range(file.num_row_groups):
+                    read = file.read_row_group(k, known, use_threads=False)
+                    values = {column: read[column].to_numpy() for column in known}
+                    rows = slice(begin, begin := begin + read.num_rows)
+                    memory.put(made, rows, values, n, allocate)
+                    del read, values
+                    memory.release_memory()
+                table = pd.DataFrame(made, columns=known, copy=False)
                 check_rows(name, table, self.metadata["animal"]["joints"])
                 other.__dict__[name] = table
         return other

@@ -77,14 +77,14 @@ class Verdict:
             accepted: whether the plan accepts misfits.
         """
         track = tracked.track
-        n_hidden = int((track.flag == "hidden").sum())
+        n_hidden = int(track.flagged("hidden").sum())
         n_depth = (
             int(observations.has_depth.sum()) - n_hidden
         )  # there is a reason for the missing pose
         n_in_view = min(int(observations.known.any(axis=1).sum()), n_depth)
         n_posed = int(track.observed.sum())
-        n_trusted = int((track.observed & (track.flag == "")).sum())
-        n_doubtful = int(np.isin(track.flag, DOUBTFUL).sum())
+        n_trusted = int((track.observed & track.flagged("")).sum())
+        n_doubtful = int(track.flagged(*DOUBTFUL).sum())
         errors = track.predicted_error_mm[track.observed]
         reasons = [*misfits, *doubts]
         crowded = int((track.n_animals > n_measured).sum())

@@ -310,7 +310,7 @@ class SessionWriter:
             origin = self.origin
             frames = np.array(self._index, np.int64)
             about = origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
-            self._rows = Rows(self.track, frames, *about)
+            self._rows = Rows(self.track, frames, *about, self.allocate)
         return self._rows
 
     def note(self, **sections: Any) -> None:

@@ -22,7 +22,7 @@ from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import Gap, frames_apart, rounded_step
 from liex_lab.recordings.timestamps import median_step as recorded_step
-from liex_lab.runtime.memory import blocks
+from liex_lab.runtime.memory import Allocator, blocks, put
 from liex_lab.scene.scene import UNKNOWN, Arena
 from liex_lab.scene.zones import Zone, joint_of, zone_names
 from liex_lab.tables.schema import (
@@ -64,6 +64,7 @@ class Rows:
         camera_gaps: irregularities of the recording's time.
         arena: outline of the floor, within which the animal can be.
         zones: zones of the plan, arena frame.
+        allocate: allocator of the columns of the table `frames`.
     """
 
     track: Track
@@ -73,6 +74,7 @@ class Rows:
     camera_gaps: Sequence[Gap] = ()
     arena: Arena = UNKNOWN
     zones: Sequence[Zone] = ()
+    allocate: Allocator = np.empty
 
     @property
     def time_s(self) -> Array:
@@ -112,44 +114,52 @@ class Rows:
     def _frame_columns(self) -> Block:
         """The columns (n,) of the table `frames`, computed once."""
         track = self.track
-        wall, zone = self._in_arena()
         missing = self.missing_before()
+        pulses = np.cumsum(missing)
+        codes: dict[str, dict[str, int]] = {"zone": {}, "flag": {}}
+        made: dict[str, NDArray[Any]] = {}
+        for part in self._parts(1):
+            rows = np.arange(part.start, min(part.stop, track.n_frames))
+            wall, zones = self._in_arena(part)
+            values = {
+                **self._when(part, 1),
+                "gap_before": missing[part],
+                "pulse_index": rows + pulses[part],
+                "wall_distance_mm": wall,
+                "spine_mm": track[part].spine_mm,
+            }
+            for name, words in (("zone", zones), ("flag", track.flag[part].tolist())):
+                known = codes[name]
+                numbers = [known.setdefault(word, len(known)) for word in words]
+                values[name] = np.array(numbers, np.int16)
+            put(made, part, values, track.n_frames, self.allocate)
+        texts = {
+            name: pa.DictionaryArray.from_arrays(made.pop(name), list(known))
+            for name, known in codes.items()
+        }
         return {
             **self._keys,
-            **self._when(slice(0, track.n_frames), 1),
+            **made,
+            **texts,
             "time_ns": track.times_ns,
-            "gap_before": missing,
-            "pulse_index": np.arange(track.n_frames) + np.cumsum(missing),
             "predicted_error_mm": track.predicted_error_mm,
             "residual_mm": track.residual_mm,
             "n_foreground_px": track.n_foreground_px,
             **{f"centroid_{a}_mm": track.centroid_mm[:, k] for k, a in enumerate("xyz")},
             **{f"centroid_{a}_px": track.centroid_px[:, k] for k, a in enumerate("uv")},
-            "wall_distance_mm": wall,
-            "zone": zone,
-            "spine_mm": track.spine_mm,
             "scale": track.scale,
             "p_flip": track.p_flip,
             "bridged": track.bridged,
-            "flag": track.flag,
             "n_animals": track.n_animals,
         }
 
-    def _in_arena(self) -> tuple[Array, pa.DictionaryArray]:
-        """Distance (n,) mm of each frame's centroid from the nearest wall, and its zones."""
-        wall = np.empty(self.track.n_frames)
-        codes = np.empty(self.track.n_frames, np.int64)
-        known: dict[str, int] = {}
+    def _in_arena(self, part: slice) -> tuple[Array, list[str]]:
+        """Distance (m,) mm of some frames' centroids from the nearest wall, and their zones."""
         names = self.track.skeleton.names
         joints = {one: joint_of(one, names) for zone in self.zones if (one := zone.part)}
-        for part in self._parts(1):
-            xy = self.track.centroid_mm[part, :2]
-            wall[part] = self.arena.wall_distance_mm(xy)
-            parts = {one: self.track.joints_mm[part, at, :2] for one, at in joints.items()}
-            codes[part] = [
-                known.setdefault(name, len(known)) for name in zone_names(self.zones, xy, parts)
-            ]
-        return wall, pa.DictionaryArray.from_arrays(codes, list(known))
+        xy = self.track.centroid_mm[part, :2]
+        parts = {one: self.track.joints_mm[part, at, :2] for one, at in joints.items()}
+        return self.arena.wall_distance_mm(xy), zone_names(self.zones, xy, parts)
 
     def _pose_rows(self, part: slice) -> Block:
         track = self.track[part]
@@ -211,7 +221,7 @@ class Rows:
         observed = self.track.observed
         lost = np.full(len(time), len(NOT_FROM_CAMERA), np.uint8)
         for k, name in enumerate(NOT_FROM_CAMERA[:-1], 1):
-            lost[self.track.flag == name] = k
+            lost[self.track.flagged(name)] = k
         lost[observed] = 0
         observed_rows = np.flatnonzero(observed)
         stops = stop_times(time)

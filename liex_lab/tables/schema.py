@@ -309,7 +309,8 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
     Args:
         schema: the columns; those missing in the block are left out.
         block: column -> one value for all rows, an array, or a `pyarrow.DictionaryArray`.
-        copy: False if the table may share the block's arrays.
+        copy: False if the table may share the block's arrays; its texts, which are one value or a
+            `pyarrow.DictionaryArray`, are then categories.
     """
     n = max((len(v) for v in block.values() if _is_array(v)), default=1)
     data: dict[str, Any] = {}
@@ -317,6 +318,11 @@ def to_pandas(schema: Sequence[Column], block: Block, copy: bool = True) -> pd.D
         if column.name not in block:
             continue
         value = block[column.name]
+        if column.dtype == "string" and not copy:
+            if not _is_array(value):
+                value = pa.DictionaryArray.from_arrays(np.zeros(n, np.int8), [str(value)])
+            data[column.name] = value.to_pandas()
+            continue
         if isinstance(value, pa.DictionaryArray):
             value = value.to_numpy(zero_copy_only=False)
         elif not _is_array(value):

@@ -213,25 +213,19 @@ def trace_back(frame, hypothesis, parent, first, path):
 
 
 @kernel()
-def forward_backward(times, one, two, error, evidence, costs, doubt):
-    """Forward-backward over two states: fill the flip posterior of each frame.
-
-    Transitions within and between the two states cost `transition_cost` of their joints; all sums
-    are in logarithms.
+def turn_costs(times, one, two, error, costs, stay, transition):
+    """Costs of the transitions within and between head and tail as they are, or exchanged.
 
     Args:
         times: (n,) s.
         one: (n, J, 3) mm, joints as on the path.
         two: (n, J, 3) mm, joints with head and tail exchanged.
         error: (n,) predicted mean joint error, mm.
-        evidence: (n,) log likelihood ratio of the frame alone, nats, positive for the first state.
         costs: `TransitionCosts`.
-        doubt: (n,) output, posterior probability of the second state.
+        stay: (n, 2) output but for the first row, `transition_cost` within each state, nats.
+        transition: (n, 2) output but for the first row, from each state to the other, nats.
     """
-    n = times.size
-    stay = np.empty((n, 2))
-    transition = np.empty((n, 2))
-    for t in range(1, n):
+    for t in range(1, times.size):
         dt = times[t] - times[t - 1]
         before = error[t - 1]
         after = error[t]
@@ -239,6 +233,21 @@ def forward_backward(times, one, two, error, evidence, costs, doubt):
         stay[t, 1] = transition_cost(two[t - 1], two[t], before, after, dt, costs)
         transition[t, 0] = transition_cost(one[t - 1], two[t], before, after, dt, costs)
         transition[t, 1] = transition_cost(two[t - 1], one[t], before, after, dt, costs)
+
+
+@kernel()
+def forward_backward(stay, transition, evidence, doubt):
+    """Forward-backward over two states: fill the flip posterior of each frame.
+
+    All sums are in logarithms.
+
+    Args:
+        stay: (n, 2) cost of remaining in each state, see `turn_costs`.
+        transition: (n, 2) cost of leaving it for the other one.
+        evidence: (n,) log likelihood ratio of the frame alone, nats, positive for the first state.
+        doubt: (n,) output, posterior probability of the second state.
+    """
+    n = evidence.size
     # forward pass: log probabilities of each state given the past
     first = np.zeros(n)
     second = np.zeros(n)

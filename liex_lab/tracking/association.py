@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.runtime.memory import Allocator, blocks
+from liex_lab.runtime.memory import Allocator, blocks, release_pages
 from liex_lab.tracking import _association_kernels as kernels
 from liex_lab.tracking.observations import Array, Observations
 from liex_lab.tracking.smoother import AssociationCosts
@@ -110,8 +110,13 @@ class HypothesisAssociation:
         for rows in blocks(n, _BLOCK):
             n_beam = kernels.extend_all(rows.start, rows.stop, chains, n_beam, frames, self.costs)
         path = np.full(n, NONE, np.int64)
-        if n_beam:
-            kernels.trace_back(chains.beam[0, 0], chains.beam[0, 1], parent, 0, path)
+        at, hypothesis = chains.beam[0] if n_beam else (NONE, NONE)
+        for rows in reversed([*blocks(n, _BLOCK)]):
+            if rows.start <= at < rows.stop:
+                kernels.trace_back(at, hypothesis, parent, rows.start, path[: rows.stop])
+                at = rows.start + int((path[rows] != NONE).argmax())
+                at, hypothesis = parent[at, path[at]]
+            release_pages()
         return path
 
     def emission(
@@ -141,10 +146,13 @@ class HypothesisAssociation:
                 part += backward[rows.start - first :][: len(part)]
             cost[rows] = part
         if self._skeleton.is_chain:
-            weight = head_tail_weight(observed) * self.independent(observed)
-            both = observed.known & observed.known[:, other]
-            least = np.fmin(cost, cost[:, other])
-            cost[:] = np.where(both, least + weight * (cost - least), cost)
+            weight = head_tail_weight(observed, allocate)
+            independent = self.independent(observed)
+            for rows in blocks(len(cost), _BLOCK):
+                part, known = cost[rows], observed[rows].known
+                least = np.fmin(part, part[:, other])
+                less = least + weight[rows] * independent * (part - least)
+                cost[rows] = np.where(known & known[:, other], less, part)
         return cost
 
     def independent(self, observed: Observations) -> float:
@@ -189,7 +197,6 @@ class HypothesisAssociation:
         path: NDArray[np.int64],
         joints: NDArray[np.float32],
         emission: Array,
-        allocate: Allocator = np.empty,
     ) -> Array:
         """Flip posterior (n,): probability that head and tail are exchanged on this path.
 
@@ -203,7 +210,6 @@ class HypothesisAssociation:
             path: (n,) from `path`.
             joints: result of `joints`.
             emission: result of `emission`.
-            allocate: allocator of intermediate arrays.
 
         Returns:
             (n,) probabilities; all 0 if the path is empty.
@@ -216,16 +222,18 @@ class HypothesisAssociation:
         evidence = (
             np.where(np.isfinite(reversed_), reversed_, self._tuning.score_most + here) - here
         )
-        one, two = (allocate((len(used), *joints.shape[2:]), joints.dtype) for _ in range(2))
+        del here, reversed_
+        error, seconds = _errors(observed), observed.seconds
+        stay, transition = np.empty((2, len(used), 2))
         for part in blocks(len(used), _BLOCK):
-            one[part] = joints[used[part], taken[part]]
-            other_way = joints[used[part], taken[part] ^ 1]
-            two[part] = np.where(np.isfinite(other_way), other_way, one[part, ::-1])
-        error = _errors(observed)[used, taken].astype(float)
+            around = slice(max(0, part.start - 1), part.stop)
+            rows, h = used[around], taken[around]
+            one, two = joints[rows, h], joints[rows, h ^ 1]
+            two = np.where(np.isfinite(two), two, one[:, ::-1])
+            known = seconds[rows], one, two, error[rows, h].astype(float), self.costs
+            kernels.turn_costs(*known, stay[around], transition[around])
         at_used = np.empty(len(used))
-        kernels.forward_backward(
-            observed.seconds[used], one, two, error, evidence, self.costs, at_used
-        )
+        kernels.forward_backward(stay, transition, evidence, at_used)
         return np.interp(np.arange(len(path)), used, at_used)
 
 

@@ -17,8 +17,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from liex_lab.body.skeleton import VIEWS
+from liex_lab.runtime.memory import in_windows
 from liex_lab.scene.height_maps import ANIMAL_HEIGHTS, N_OBJECTS
-from liex_lab.tracking.observations import Array, Observations
+from liex_lab.tracking.observations import Array, Observations, Small
 from liex_lab.tracking.track import spans
 
 Mask = NDArray[np.bool_]
@@ -58,7 +59,7 @@ def count_animals(observed: Observations) -> Count:
     Args:
         observed: hypotheses (n, H) of all frames, with their objects.
     """
-    objects = observed.objects.astype(float)
+    objects = observed.objects
     seconds = observed.seconds
     some = np.asarray(observed.known.any(axis=1))
     in_view = some.astype(np.int64)
@@ -91,16 +92,20 @@ def _merged(there: Mask, free: Mask, near: Mask) -> Mask:
     return merged
 
 
-def _free(objects: Array, seconds: Array, stands: bool) -> tuple[NDArray[np.int64], Array, Mask]:
+def _free(objects: Small, seconds: Array, stands: bool) -> tuple[NDArray[np.int64], Array, Mask]:
     """Animals that stand free (n,), the area (n,) mm^2 of all objects of each frame, and whether
     two of them are within a length of each other.
     """
     known = np.isfinite(objects[..., 0])
-    area = np.where(known, objects[..., 3], 0.0).sum(axis=1)
+    area = in_windows(
+        len(known),
+        0,
+        lambda at: np.where(known[at], objects[at, :, 3], 0.0).sum(axis=1, dtype=float),
+    )
     rows, _ = np.nonzero(known)
-    nodes = objects[known]
+    nodes = objects[known].astype(float)
     # of the components most similar in area to the session's animal
-    height, area_mm2 = np.median(objects[known[:, 0], 0, 2:], axis=0)
+    height, area_mm2 = np.median(objects[known[:, 0], 0, 2:].astype(float), axis=0)
     usual = float(np.sqrt(area_mm2))
     label = _tracklets(nodes, rows, seconds, usual)
     order = np.lexsort((rows, label))
@@ -117,9 +122,15 @@ def _free(objects: Array, seconds: Array, stands: bool) -> tuple[NDArray[np.int6
     free = np.zeros(len(objects), np.int64)
     for part, is_own in zip(parts, own, strict=True):
         free[rows[part[0]] : rows[part[-1]] + 1] += is_own
-    off = np.linalg.norm(objects[:, :, None, :2] - objects[:, None, :, :2], axis=-1)
-    off[:, range(N_OBJECTS), range(N_OBJECTS)] = np.inf
-    return free, area, np.asarray((off < _BESIDE * usual).any(axis=(1, 2)))
+
+    def near(at: slice) -> Mask:
+        """Whether two objects of some frames are near each other."""
+        xy = objects[at, :, :2].astype(float)
+        off = np.linalg.norm(xy[:, :, None] - xy[:, None], axis=-1)
+        off[:, range(N_OBJECTS), range(N_OBJECTS)] = np.inf
+        return np.asarray((off < _BESIDE * usual).any(axis=(1, 2)))
+
+    return free, area, in_windows(len(objects), 0, near)
 
 
 def _moves(nodes: Array, rows: NDArray[np.int64], seconds: Array, usual: float) -> bool:

@@ -215,7 +215,7 @@ def _associate(
     joints = chain.joints(observed, allocate)
     emission = chain.emission(observed, joints, allocate)
     path = chain.path(observed, joints, emission, allocate=allocate)
-    return path, chain.doubt(observed, path, joints, emission, allocate)
+    return path, chain.doubt(observed, path, joints, emission)
 
 
 def _bridge_and_flag(
@@ -251,9 +251,10 @@ def _bridge_and_flag(
         some = (mask[rows] for mask in masks)
         mask_and_flag(subject, part, observed[rows], path[rows], doubt[rows], *some)
         hide(part, hidden[rows])
-    for name in SIGHT:  # a copy shows what its original shows
+    shown = observed.shown[copies] if copies.any() else copies[:0]
+    for name in SIGHT if copies.any() else ():  # a copy shows what its original shows
         column = getattr(track, name)
-        column[copies] = column[observed.shown[copies]]
+        column[copies] = column[shown]
 
 
 def _turn_round(
@@ -261,13 +262,13 @@ def _turn_round(
     path: NDArray[np.int64],
     doubt: Array,
     exchanged: Sequence[tuple[int, int]],
-) -> NDArray[np.int64]:
+) -> NDArray[np.int8]:
     """Exchange head and tail in the spans that a person corrected; their flip posterior is 0.
 
     The path uses the reversed hypothesis if the frame has one. Returns how many times (n,) the pose
     itself must be reversed elsewhere.
     """
-    turned = np.zeros(len(observed), np.int64)
+    turned = np.zeros(len(observed), np.int8)
     for start, stop in exchanged:
         rows = start + np.flatnonzero(path[start:stop] != NONE)
         has_other = observed.known[rows, path[rows] ^ 1]
@@ -280,7 +281,7 @@ def _turn_round(
 def _half_turns(
     observed: Observations,
     path: NDArray[np.int64],
-    turned: NDArray[np.int64],
+    turned: NDArray[np.int8],
     exchanged: Sequence[tuple[int, int]],
 ) -> list[int]:
     """The ends of a person's exchanges at which the body turns by more than 90 degrees.

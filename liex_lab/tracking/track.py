@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
-from liex_lab.runtime.memory import Allocator, Rows, blocks
+from liex_lab.runtime.memory import Allocator, Rows, blocks, in_windows
 
 Array = NDArray[np.float64]
 
@@ -179,6 +178,10 @@ class Track(Rows):
     def observed(self) -> NDArray[np.bool_]:
         """(n,) True if a pose was measured."""
         return self.posed & ~self.bridged
+
+    def flagged(self, *flags: str) -> NDArray[np.bool_]:
+        """(n,) True if the flag is one of these."""
+        return in_windows(self.n_frames, 0, lambda rows: np.isin(self.flag[rows], flags))
 
     @property
     def root(self) -> SE3:
@@ -346,18 +349,19 @@ def short_gaps(
     Returns:
         (n,) bool, False at measured frames.
     """
-    rows = np.flatnonzero(measured)
+    rows, lost = (np.flatnonzero(some) for some in (measured, ~measured))
+    short = np.zeros(len(measured), np.bool_)
     if not len(rows):
-        return np.zeros(len(measured), np.bool_)
-    after = np.searchsorted(rows, np.arange(len(measured)))
+        return short
+    after = np.searchsorted(rows, lost)
     inside = (after > 0) & (after < len(rows))
-    before = rows[np.maximum(after - 1, 0)]
+    before = seconds[rows[np.maximum(after - 1, 0)]]
     after = rows[np.minimum(after, len(rows) - 1)]
-    away = np.minimum(seconds - seconds[before], seconds[after] - seconds)
-    short = inside & (away <= 0.5 * bridge_s)
+    away = np.minimum(seconds[lost] - before, seconds[after] - seconds[lost])
+    short[lost] = inside & (away <= 0.5 * bridge_s)
     if ahead:
         short[rows[-1] + 1 :] = seconds[rows[-1] + 1 :] - seconds[rows[-1]] <= bridge_s
-    return short & ~measured
+    return short
 
 
 def whole_gaps(seconds: Array, measured: NDArray[np.bool_], bridge_s: float) -> NDArray[np.bool_]:
@@ -373,7 +377,8 @@ def whole_gaps(seconds: Array, measured: NDArray[np.bool_], bridge_s: float) -> 
     """
     rows = np.flatnonzero(measured)
     out = np.zeros(len(measured), np.bool_)
-    for before, after in pairwise(rows):
+    at = np.flatnonzero(np.diff(rows) > 1)
+    for before, after in zip(rows[at], rows[at + 1], strict=True):
         out[before + 1 : after] = seconds[after] - seconds[before] <= bridge_s
     return out
 

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.geometry import so3
+from liex_lab.runtime.memory import Allocator, in_windows
 from liex_lab.tracking._association_kernels import NONE
 from liex_lab.tracking.observations import Array, Observations, joints_of
 from liex_lab.tracking.smoother import SmoothedCurve, TrackingParameters
@@ -60,13 +61,19 @@ def contradicted(
     limit = min(
         max(4.0 * finite_median(residual, 0.0), 0.04 * length_mm), MOST_RESIDUAL * length_mm
     )
-    with np.errstate(invalid="ignore"):
-        return np.asarray(
-            (residual > limit)
-            | (observed.along(observed.part_mm, path) > MOST_RESIDUAL * length_mm)
-            | (observed.along(observed.covered, path) < 0.35)
-            | (observed.along(observed.beside, path) > 0.6)
-        )
+
+    def disagrees(at: slice) -> NDArray[np.bool_]:
+        """Whether the depth image contradicts the poses of some frames."""
+        some, h = observed[at], path[at]
+        with np.errstate(invalid="ignore"):
+            return np.asarray(
+                (residual[at] > limit)
+                | (some.along(some.part_mm, h) > MOST_RESIDUAL * length_mm)
+                | (some.along(some.covered, h) < 0.35)
+                | (some.along(some.beside, h) > 0.6)
+            )
+
+    return in_windows(len(observed), 0, disagrees)
 
 
 def finite_median(values: Array, otherwise: float) -> float:
@@ -118,9 +125,15 @@ def share_in_view(observed: Observations, path: NDArray[np.int64], usual_px: flo
     Returns:
         1 if it is unobstructed, or if there is no hypothesis.
     """
-    meant = np.where((path < 0) & observed.known[:, 0], 0, path)
-    behind, shown = (observed.along(values, meant) for values in (observed.behind, observed.n_px))
-    return np.where(meant >= 0, visible_share(behind, shown, usual_px), 1.0)
+
+    def share(at: slice) -> Array:
+        """The share of some frames."""
+        some = observed[at]
+        meant = np.where((path[at] < 0) & some.known[:, 0], 0, path[at])
+        behind, shown = (some.along(values, meant) for values in (some.behind, some.n_px))
+        return np.where(meant >= 0, visible_share(behind, shown, usual_px), 1.0)
+
+    return in_windows(len(observed), _FRAMES, share)
 
 
 def lies_unknown(in_view: Array, doubt: Array) -> NDArray[np.bool_]:
@@ -150,7 +163,7 @@ def visible_share(behind: Array, shown_px: Array, usual_px: float, beside: int =
     return np.where(most > _BEHIND, np.minimum(shown_px / max(usual_px, 1.0), 1.0), 1.0)
 
 
-def head_tail_weight(observed: Observations) -> Array:
+def head_tail_weight(observed: Observations, allocate: Allocator = np.empty) -> Array:
     """The weight (n, H), 0 to 1, of each hypothesis as evidence for which end is the head.
 
     The metric was not trained on partly hidden animals, and confuses their ends in many consecutive
@@ -158,17 +171,20 @@ def head_tail_weight(observed: Observations) -> Array:
 
     Args:
         observed: hypotheses (n, H) of consecutive frames.
+        allocate: allocator of the result.
 
     Returns:
         1 if all of it is visible, or if there is no hypothesis.
     """
     usual_px = usual_pixels(observed, np.where(observed.known[:, 0], 0, -1))
-    weight = np.ones(observed.score.shape)
-    for h in range(observed.score.shape[1]):
-        behind, shown = (values[:, h].astype(float) for values in (observed.behind, observed.n_px))
-        share = visible_share(behind, shown, usual_px)
-        weight[:, h] = np.clip((share - MOSTLY) / (WHOLE - MOSTLY), 0.0, 1.0) ** 2
-    return weight
+
+    def weight(at: slice) -> Array:
+        """The weight of some frames."""
+        behind, shown = (values[at].T.astype(float) for values in (observed.behind, observed.n_px))
+        share = np.array([visible_share(*one, usual_px) for one in zip(behind, shown, strict=True)])
+        return np.clip((share.T - MOSTLY) / (WHOLE - MOSTLY), 0.0, 1.0) ** 2
+
+    return in_windows(len(observed), _FRAMES, weight, allocate)
 
 
 def gone_behind(

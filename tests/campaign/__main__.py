@@ -28,7 +28,7 @@ SIZES = {
     "workers": 20,
     "slurm": 20,
 }
-OTHERS = ("faults", "broken", "fuzz", "day")
+OTHERS = ("faults", "broken", "fuzz", "day", "day-end")
 
 
 def main() -> None:
@@ -98,7 +98,8 @@ def _other(asked: argparse.Namespace) -> dict[str, Any]:
         "faults": lambda: faults.faults(asked.n or 3, asked.frames or 300, asked.seed),
         "broken": lambda: studies.broken(asked.n or 100, asked.frames or 30, 2, asked.folder),
         "fuzz": lambda: fuzz.fuzz(asked.minutes, asked.seed),
-        "day": lambda: day.day(asked.folder or Path("day"), asked.minutes, 30.0, asked.seed),
+        "day": lambda: day.day(asked.folder or Path("day"), asked.minutes, asked.seed),
+        "day-end": lambda: day.day(asked.folder or Path("day"), asked.minutes, asked.seed, True),
     }
     return others[asked.part]()
 

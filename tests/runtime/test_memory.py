@@ -13,10 +13,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from liex_lab.behaviour.kinematics import neighbours
 from liex_lab.catalog import find_sample
 from liex_lab.errors import LiexError, RecordingError
 from liex_lab.recordings.formats.messages import messages
-from liex_lab.runtime.memory import blocks, check_limits, mapped, on_disk, release_memory, why_short
+from liex_lab.recordings.timestamps import frames_apart, median_step
+from liex_lab.runtime import memory
+from liex_lab.runtime.memory import (
+    blocks,
+    check_limits,
+    in_windows,
+    mapped,
+    on_disk,
+    release_memory,
+    why_short,
+)
 from liex_lab.sessions.folder import describe_failure
 
 _MB = 1 << 20
@@ -53,6 +64,51 @@ def test_going_through_rows_in_blocks_holds_no_more_than_a_block_of_what_lies_on
         assert resident_mb() - before < 40  # three blocks of 8 MB, of 64 MB in all
     assert resident_mb() - before < 8
     assert (doubled[::1000] == 2 * np.arange(0, n, 1000)).all()
+
+
+@pytest.mark.parametrize("n", [0, 1, 63, 64, 65, 200])
+def test_rows_made_in_windows_are_those_of_the_whole(n, tmp_path, monkeypatch):
+    values = np.random.default_rng(n).normal(size=(n, 2))
+
+    def around(at: slice) -> np.ndarray:
+        return (
+            np.lib.stride_tricks.sliding_window_view(
+                np.pad(values[at], ((3, 3), (0, 0)), mode="edge"), 7, axis=0
+            ).max(axis=-1)
+            if at.stop > at.start
+            else values[at]
+        )
+
+    whole = around(slice(0, n))
+    monkeypatch.setattr(memory, "_WINDOW", 64)
+    np.testing.assert_array_equal(in_windows(n, 3, around, on_disk(tmp_path)), whole)
+
+
+def test_a_clock_and_its_neighbours_do_not_depend_on_the_size_of_windows(monkeypatch):
+    rng = np.random.default_rng(1)
+    steps = rng.choice([1, 1, 1, 1, 2, 40], 3000)
+    exact = 33_366_700 * np.cumsum(steps)
+    clocks = [
+        exact,
+        exact + rng.normal(0.0, 1e6, 3000).astype(np.int64),
+        (np.round(exact / 1e6) * 1e6).astype(np.int64),
+    ]
+    observed = rng.random(3000) > 0.05
+
+    def found() -> list[np.ndarray]:
+        return [
+            result
+            for times in clocks
+            for result in (
+                frames_apart(times, median_step(times)),
+                *neighbours(times * 1e-9, observed, 0.1),
+            )
+        ]
+
+    whole = found()
+    monkeypatch.setattr(memory, "_WINDOW", 64)
+    for one, other in zip(whole, found(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_disk_without_room_is_told_before_any_of_it_is_taken(tmp_path, monkeypatch):
