@@ -2,7 +2,7 @@
 
 Names of animals and sessions come from the recordings' metadata, BIDS-like folders (`sub-m01`,
 `ses-01_date-20260821`), other folders and file names, see `plan.study`. Duplicate recordings are
-listed once.
+listed once; files that one camera wrote one after the other are one session.
 """
 
 import hashlib
@@ -10,10 +10,11 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
 
-from liex_lab.errors import StudyError, refuse
+from liex_lab.errors import RecordingError, StudyError, refuse
 from liex_lab.plan.study import (
     CONTAINER,
     DERIVED,
@@ -24,8 +25,10 @@ from liex_lab.plan.study import (
     letters,
     same,
 )
-from liex_lab.recordings.open import stated_subject
-from liex_lab.runtime.durable import write_whole
+from liex_lab.recordings.formats.images.folder import natural_key
+from liex_lab.recordings.open import open_recording, stated_subject
+from liex_lab.recordings.parts import join_parts
+from liex_lab.runtime.durable import named_files, write_whole
 from liex_lab.runtime.progress import Progress, silent
 
 _DEPTHS = ("depth.dat", "depth.avi", "depth.mkv")  # each marks its folder as a recording
@@ -104,8 +107,9 @@ def begin_study(
         )
     twins = find_twins(found)
     stated: dict[Path, str] = {}
-    for path in (one for one in found if one not in twins):
-        progress(len(stated), len(found) - len(twins), "reading subjects")
+    listed = join_series([one for one in found if one not in twins])
+    for path in listed:
+        progress(len(stated), len(listed), "reading subjects")
         stated[path] = stated_subject(path, progress)
     named, notes = name_sessions(stated, raw)
     notes += [
@@ -118,6 +122,42 @@ def begin_study(
     for line in (*_listed(named), *notes):
         echo(line)
     return file
+
+
+def join_series(recordings: Sequence[Path]) -> list[Path]:
+    """Replace files that one camera wrote one after the other by a pattern of their names.
+
+    Their names differ by a number or a time at the end, and no more than two seconds lie between
+    the end of one and the beginning of the next.
+
+    Args:
+        recordings: files or folders.
+
+    Returns:
+        Patterns, and the recordings that are whole by themselves.
+    """
+    found = list(recordings)
+    for number in (r"\d+(?=\D*$)", r"(?<=[_.T-])\d[\d_.T-]*(?=\D*$)"):
+        alike: dict[Path, list[Path]] = {}
+        for path in found:
+            pattern = path.with_name(re.sub(number, "*", path.stem) + path.suffix)
+            alike.setdefault(pattern, []).append(path)
+        found = []
+        for pattern, paths in alike.items():
+            paths.sort(key=lambda path: natural_key(path.name))
+            whole = sorted(named_files(pattern)) == sorted(paths)
+            series = len(paths) > 1 and whole and all(map(_follows, paths[:-1], paths[1:]))
+            found += [pattern] if series else paths
+    return found
+
+
+def _follows(one: Path, other: Path) -> bool:
+    """Whether a recording goes on in another one."""
+    try:
+        with join_parts([one, other], partial(open_recording, strict=True), unbroken=True):
+            return True
+    except RecordingError:
+        return False
 
 
 def _listed(named: Sequence[Named]) -> list[str]:

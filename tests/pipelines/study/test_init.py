@@ -4,6 +4,7 @@ import json
 import tarfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,10 @@ from typer.testing import CliRunner
 
 from liex_lab import cli
 from liex_lab.errors import StudyError
+from liex_lab.optics.camera import Camera
 from liex_lab.plan.study import Study, find_subject
+from liex_lab.recordings.frame import DepthFrame
+from liex_lab.recordings.writer import McapDepthWriter
 
 
 def touch(root: Path, *names: str) -> None:
@@ -204,6 +208,23 @@ def test_init_asks_whether_the_animals_are_right_and_says_what_names_none(tmp_pa
     text = (tmp_path / "study.toml").read_text()
     assert 'id = "m01"  # named by: file name' in text
     assert "# note: nothing names the animal of 20260821" in text
+
+
+@pytest.mark.parametrize(
+    "names", [("m1_9", "m1_10"), ("m1_2026-03-02T07-59", "m1_2026-03-02T08-00")]
+)
+def test_files_of_one_camera_that_follow_each_other_are_one_session(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+    depth = np.full((48, 64), 700.0, np.float32)
+    for first_s, name in ((0, names[0]), (1, names[1]), (90, "mouse7"), (9000, "mouse8")):
+        with McapDepthWriter(tmp_path / f"{name}.mcap", camera) as file:
+            for k in range(30):
+                file.add(DepthFrame(k, (first_s * 30 + k) * 33_333_333, depth))
+    begin_study(tmp_path)
+    recordings = [Path(one.recording) for one in Study.load(tmp_path / "study.toml").sessions]
+    assert [one.name for one in recordings] == ["m1_*.mcap", "mouse7.mcap", "mouse8.mcap"]
 
 
 def test_a_placeholder_in_metadata_is_no_animal(tmp_path: Path) -> None:
