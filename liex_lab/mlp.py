@@ -17,7 +17,6 @@ from liex_lab.runtime.processes import serial_products
 
 Array = NDArray[np.float64]
 
-_AT_ONCE = 2048  # samples in memory
 LIMIT = 6.0  # standard deviations at which features are clipped
 
 
@@ -51,17 +50,13 @@ class Network:
         Returns:
             (m, K) logits.
         """
-        found = []
+        x = np.clip((features - self.centre) / self.scale, -LIMIT, LIMIT)
         with serial_products():
-            for begin in range(0, max(1, len(features)), _AT_ONCE):
-                some = features[begin : begin + _AT_ONCE]
-                x = np.clip((some - self.centre) / self.scale, -LIMIT, LIMIT)
-                for k, (weights, bias) in enumerate(self.layers):
-                    x = x @ weights + bias
-                    if k + 1 < len(self.layers):
-                        x = np.maximum(x, 0.0)
-                found.append(x)
-        return np.concatenate(found, dtype=np.float64)
+            for k, (weights, bias) in enumerate(self.layers):
+                x = x @ weights + bias
+                if k + 1 < len(self.layers):
+                    x = np.maximum(x, 0.0)
+        return x.astype(np.float64)
 
 
 def check_layers(network: Network, n_outputs: int) -> None:
