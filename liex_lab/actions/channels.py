@@ -11,7 +11,7 @@ Frames whose trunk points against those within 0.15 s to either side are left ou
 were exchanged). Gaps up to 0.4 s are bridged; longer ones split the track into segments.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -355,6 +355,13 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
     Returns:
         (m, F) float32.
     """
+    return next(feature_blocks(segment, names, len(segment.times_s)))
+
+
+def feature_blocks(
+    segment: Segment, names: Sequence[str], size: int
+) -> Iterator[NDArray[np.float32]]:
+    """Yield the `window_features` of a segment, `size` ticks at a time."""
     from scipy.ndimage import maximum_filter1d
 
     x = segment.values
@@ -362,26 +369,29 @@ def window_features(segment: Segment, names: Sequence[str]) -> NDArray[np.float3
     signed = np.array([name.endswith("~") for name in names])
     start_at = np.zeros((1, x.shape[1]))
     sums, squares = (np.concatenate([start_at, np.cumsum(v, axis=0)]) for v in (x, x * x))
-    parts: list[NDArray[Any]] = [x, np.abs(x[:, signed])]
-    for half in (0.06, 0.2, 0.6):
-        mean, square = (_window_mean(total, -half, half, step) for total in (sums, squares))
-        spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
-        parts += [mean.astype(np.float32), np.abs(mean[:, signed]), spread.astype(np.float32)]
-    for start, stop in ((-0.9, -0.35), (-0.35, -0.08), (0.08, 0.35), (0.35, 0.9)):
-        mean, square = (_window_mean(total, start, stop, step) for total in (sums, squares))
-        level = np.where(signed, np.abs(mean), mean)
-        parts += [level.astype(np.float32), np.sqrt(np.maximum(square, 0.0)).astype(np.float32)]
     width = 2 * max(1, round(0.25 / step)) + 1
-    parts.append(maximum_filter1d(np.abs(x), width, axis=0, mode="nearest"))
-    return np.concatenate(parts, axis=1, dtype=np.float32)
+    largest = maximum_filter1d(np.abs(x), width, axis=0, mode="nearest")
+    for begin in range(0, len(x), size):
+        rows = np.arange(begin, min(begin + size, len(x)))
+        parts: list[NDArray[Any]] = [x[rows], np.abs(x[rows][:, signed])]
+        for half in (0.06, 0.2, 0.6):
+            mean, square = (_window_mean(one, rows, -half, half, step) for one in (sums, squares))
+            spread = np.sqrt(np.maximum(square - mean * mean, 0.0))
+            parts += [mean.astype(np.float32), np.abs(mean[:, signed]), spread.astype(np.float32)]
+        for start, stop in ((-0.9, -0.35), (-0.35, -0.08), (0.08, 0.35), (0.35, 0.9)):
+            mean, square = (_window_mean(one, rows, start, stop, step) for one in (sums, squares))
+            level = np.where(signed, np.abs(mean), mean)
+            parts += [level.astype(np.float32), np.sqrt(np.maximum(square, 0.0)).astype(np.float32)]
+        yield np.concatenate([*parts, largest[rows]], axis=1, dtype=np.float32)
 
 
-def _window_mean(total: Array, start_s: float, stop_s: float, step: float) -> Array:
-    """Means (m, C) over [t + start_s, t + stop_s] from running sums (m + 1, C), clipped at the
-    ends.
+def _window_mean(
+    total: Array, rows: NDArray[np.int64], start_s: float, stop_s: float, step: float
+) -> Array:
+    """Means (k, C) over [t + start_s, t + stop_s] of some rows from running sums (m + 1, C),
+    clipped at the ends.
     """
     m = len(total) - 1
-    rows = np.arange(m)
     low = np.clip(rows + round(start_s / step), 0, m - 1)
     high = np.clip(rows + round(stop_s / step), 0, m - 1) + 1
     return np.asarray((total[high] - total[low]) / (high - low)[:, None])

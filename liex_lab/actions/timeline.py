@@ -22,7 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from liex_lab.actions import _semi_markov_kernels as kernels
-from liex_lab.actions.channels import Segment, channel_names, segments_of, window_features
+from liex_lab.actions.channels import (
+    Segment,
+    channel_names,
+    feature_blocks,
+    segments_of,
+    window_features,
+)
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
@@ -169,6 +175,7 @@ CLOCKS_HZ = {"fish": 50.0}
 CLOCK_HZ = 30.0
 # ticks per block of features
 _PIECE = 16_384
+_AT_ONCE = 2048  # and of these, ticks whose features are in memory
 # half window of the speed; tolerances of its limits; penalty beyond them, nats
 _SLACK = 1.25
 _STILL = 0.1
@@ -227,11 +234,12 @@ class TimelineModel:
         for ticks in blocks(m, _PIECE):
             low = max(0, ticks.start - margin)
             high = min(m, ticks.stop + margin)
-            features = window_features(
-                Segment(segment.times_s[low:high], segment.values[low:high]), names
-            )
-            features = features[ticks.start - low : ticks.stop - low]
-            p = np.mean([_softmax(network.logits(features)) for network in self.networks], axis=0)
+            around = Segment(segment.times_s[low:high], segment.values[low:high])
+            named = [
+                np.mean([_softmax(network.logits(some)) for network in self.networks], axis=0)
+                for some in feature_blocks(around, names, _AT_ONCE)
+            ]
+            p = np.concatenate(named)[ticks.start - low : ticks.stop - low]
             now = speed[ticks, None]
             beyond = (now < self.speeds[:, 0] / _SLACK) | (
                 now > self.speeds[:, 1] * _SLACK + _STILL
