@@ -251,7 +251,7 @@ def test_the_animals_of_one_arena_are_sessions_that_are_measured_together(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "says"),
+    ("old", "new", "message"),
     [
         ('animals = ["m01", "m02"]', "", "should name its animal"),
         ('animals = ["m01", "m02"]', 'animal = "m01"\nanimals = ["m01", "m02"]', "should name"),
@@ -273,14 +273,14 @@ def test_the_animals_of_one_arena_are_sessions_that_are_measured_together(tmp_pa
         ),
     ],
 )
-def test_a_slip_in_the_animals_of_one_arena_is_told(
-    tmp_path: Path, old: str, new: str, says: str
+def test_a_slip_in_the_animals_of_one_arena_is_refused(
+    tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     assert old in PAIRS
-    if not says:  # the number of names counts
+    if not message:  # the number of names counts
         assert study_of(PAIRS.replace(old, new), tmp_path).sessions[1].plan.animal.count == 2
         return
-    with pytest.raises(StudyError, match=says):
+    with pytest.raises(StudyError, match=message):
         read_whole(PAIRS.replace(old, new, 1), tmp_path)
 
 
