@@ -526,7 +526,7 @@ def evaluate_several(
         int, typer.Option("--frames", min=300, help="Number of frames of each recording.")
     ] = 1800,
     n_recordings: Annotated[
-        int, typer.Option("--recordings", min=1, max=12, help="Number of recordings.")
+        int, typer.Option("--recordings", min=1, max=48, help="Number of recordings.")
     ] = 6,
     sealed: Annotated[
         bool,
