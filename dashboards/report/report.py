@@ -491,4 +491,6 @@ def glossary(session: Session) -> list[tuple[str, list[dict[Hashable, Any]]]]:
 
 def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds, 1) if seconds < 60 else round(seconds), 60)
+    if minutes >= 120:
+        return f"{minutes // 60:.0f} h {minutes % 60:.0f} min"
     return f"{rest:.1f} s" if minutes < 1 else f"{minutes:.0f} min {rest:.0f} s"
