@@ -53,15 +53,18 @@ class Count:
     share: float
 
 
-def count_animals(observed: Observations) -> Count:
+def count_animals(observed: Observations, n_measured: int = 1) -> Count:
     """Count the animals in view in the frames of a recording.
 
     Args:
         observed: hypotheses (n, H) of all frames, with their objects.
+        n_measured: of how many animals these are the hypotheses of one.
     """
     objects = observed.objects
     seconds = observed.seconds
     some = np.asarray(observed.known.any(axis=1))
+    if n_measured > 1:  # where it is hidden, another one may be in view
+        some |= np.isfinite(objects[:, 0, 0])
     in_view = some.astype(np.int64)
     n_animals = int(some.any())
     if np.isfinite(objects[:, 1, 0]).any():  # else there is never a second one

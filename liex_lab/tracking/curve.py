@@ -152,7 +152,7 @@ def track_whole(
         The track (n rows) and the flips, those found and those of `corrections`, in order of time.
     """
     tuning = tuning or TrackingParameters.of(subject.skeleton.name)
-    count = count_animals(observed)
+    count = count_animals(observed, subject.n_measured)
     if np.isfinite(observed.objects).any():  # which sessions of earlier versions lack
         subject = replace(subject, n_animals=count.n_animals)
     path, doubt = _associate(subject, observed, tuning, allocate)

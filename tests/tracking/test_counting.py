@@ -90,3 +90,10 @@ def test_no_pose_is_trusted_while_another_animal_is_in_view() -> None:
     assert (tracked.n_animals, tracked.n_animals_share) == (2, 0.5)
     assert (tracked.track.flag == np.where(np.arange(240) < 120, "", "doubtful")).all()
     assert (tracked.track.n_animals == np.where(np.arange(240) < 120, 1, 2)).all()
+
+
+def test_a_hidden_one_of_two_that_are_measured_does_not_change_how_many_are_counted() -> None:
+    seen = scene(second=beside())
+    seen.score[TOUCH] = np.nan
+    assert (count_animals(seen, 2).in_view == 2).all()
+    assert (count_animals(seen).in_view[TOUCH] == 0).all()
