@@ -24,6 +24,7 @@ from liex_lab.behaviour.cohort import (
     methods,
     result,
     unified,
+    unit_of,
     usual_measures,
 )
 from liex_lab.errors import LiexError, SessionError
@@ -160,7 +161,7 @@ def _write_tables(
     }
     first = next(iter(sessions.values())).columns
     units = dict(zip(first["name"], first["unit"].fillna(""), strict=True))
-    results = [result(row, units.get(row["measure"], "")) for row in stats.to_dict("records")]
+    results = [result(row, unit_of(row["measure"], units)) for row in stats.to_dict("records")]
     warned = [f"Check this result: {one}." for one in check]
     texts = {
         "columns.json": json.dumps(columns, indent=1, ensure_ascii=False),

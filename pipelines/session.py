@@ -567,14 +567,20 @@ def prepare(fitted: Fitted, folder: Path, started: float, progress: Progress) ->
 
     Raises:
         ModelError: there is no such recogniser.
-        PlanError: the recogniser was made for another skeleton, or [light] is stated and the time
-            of day of the recording is unknown.
+        PlanError: the recogniser was made for another skeleton, [light] is stated and the time of
+            day of the recording is unknown, or a period is not in the recording.
         SessionError: there is not enough disk space.
     """
     build_recogniser(fitted.plan, fitted.tracker.estimator.skeleton)
 
     origin = build_provenance(fitted.recording, fitted.plan, fitted.tracker, progress)
     Light.of(fitted.plan.light.model_dump(), origin.session_start_time)
+    list(  # refuses periods that are not in the recording
+        summary.frames_of_periods(
+            fitted.plan.behaviour,
+            (fitted.recording.times_ns - fitted.recording.times_ns[:1]) / 1e9,
+        )
+    )
     needed = session_bytes(
         fitted.recording, fitted.plan, fitted.tracker.spine_mm, origin.floor_distance_mm
     )

@@ -42,6 +42,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
 def test_the_folder_is_whole(session: Session) -> None:
     others = {"crossings.parquet", "interactions.parquet", "interaction_totals.parquet"}
     others |= {"triggers.parquet", "moseq.parquet", "hours.parquet", "rhythm.parquet"}
+    others |= {"periods.parquet"}
     assert {path.name for path in session.path.iterdir()} == {
         *FILES.keys() - others,
         "report.html",

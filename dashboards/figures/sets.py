@@ -14,7 +14,7 @@ import pandas as pd
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
-from liex_lab.behaviour.cohort import SUBJECT
+from liex_lab.behaviour.cohort import SUBJECT, unit_of
 from liex_lab.errors import SessionError
 from liex_lab.plan.study import references_first
 from liex_lab.runtime import durable, memory, text_files
@@ -113,12 +113,13 @@ def comparison_figures(
     )
     known = columns[columns["table"] == "summary"].drop_duplicates("name")
     units = dict(zip(known["name"].astype(str), known["unit"].fillna("").astype(str), strict=True))
+    units = {name: unit_of(name, units) for name in stats["measure"].astype(str)}
     accounted = str(table.attrs.get("accounted", ""))
     only = only or ("effects", *stats["measure"].astype(str), *OF_STUDY)
     if "effects" in only:
         yield "effects", "effect sizes with their intervals", groups.effects(stats, units)
     for measure in (one for one in dict.fromkeys(stats["measure"].astype(str)) if one in only):
-        drawn = groups.comparison(table, stats, measure, units.get(measure, ""), accounted)
+        drawn = groups.comparison(table, stats, measure, units[measure], accounted)
         yield _name_of(measure), "every animal, and the difference", drawn
     wanted = [name for name in OF_STUDY if name in only]
     if sessions and wanted:

@@ -225,7 +225,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 _TABLES = (
     *("frames", "poses", "rotations", "kinematics", "bouts", "gaps", "flips", "sessions"),
     *("summary", "transitions", "activity", "hours", "rhythm", "zones", "events"),
-    *("crossings", "interactions", "interaction_totals", "triggers"),
+    *("periods", "crossings", "interactions", "interaction_totals", "triggers"),
 )
 
 
@@ -291,6 +291,9 @@ def render(session: Session, figures: Path | None = None) -> str:
         unresolved=about.get("unresolved_actions") or {},
         summary=summary_rows(session, words),
         rhythm=rhythm_rows(session),
+        periods=session.table("periods").to_dict("records")
+        if session.has("periods.parquet")
+        else [],
         budget=budget_rows(session, words),
         across_gaps=ethogram.ACROSS_GAPS,
         arena=session.arena,

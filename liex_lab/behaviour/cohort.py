@@ -89,25 +89,53 @@ def collect(sessions: Iterable[SessionTables]) -> pd.DataFrame:
     Returns:
         Columns of the tables `sessions` and `summary`, and n_bouts; a column of both tables has the
             suffix `_summary` for the second. Sessions of plans that state the light have measures
-            of their rhythm. Animals of one arena also have its name, `arena`,
-            whether they may have been exchanged, `exchanged`, and its `arena_measures`.
+            of their rhythm, and of plans that state periods the difference of each period from the
+            first one, such as `after_minus_baseline_rear_share`. Animals of one arena also have its
+            name, `arena`, whether they may have been exchanged, `exchanged`, and its
+            `arena_measures`.
     """
     rows = [
         session.table("sessions")
         .merge(session.summary, on=["session_id", "individual"], suffixes=("", "_summary"))
-        .assign(n_bouts=len(session.table("bouts", ["action"])), **_of_days(session))
+        .assign(n_bouts=len(session.table("bouts", ["action"])), **_of_parts(session))
         .assign(**_together(session))
         for session in sessions
     ]
     return pd.concat(rows or [pd.DataFrame(columns=["session_id", *SUBJECT])], ignore_index=True)
 
 
-def _of_days(session: SessionTables) -> dict[str, float]:
-    """The measures of a session's rhythm; nothing without the table."""
-    if "rhythm.parquet" not in session.metadata.get("files", {}):
-        return {}
-    day = session.table("rhythm").iloc[0]
-    return {name: float(day[name]) for name in _OF_DAYS}
+def _of_parts(session: SessionTables) -> dict[str, float]:
+    """How the parts of a session differ: the measures of its rhythm, and of each period minus those
+    of the first one (only what does not grow with a period's length); nothing without the tables.
+    """
+    files = session.metadata.get("files", {})
+    found = {}
+    if "rhythm.parquet" in files:
+        found = {
+            name: float(value)
+            for name, value in zip(
+                _OF_DAYS, session.table("rhythm")[[*_OF_DAYS]].iloc[0], strict=True
+            )
+        }
+    if "periods.parquet" in files:
+        first, *others = session.table("periods").to_dict("records")
+        found |= {
+            f"{one['period']}_minus_{first['period']}_{name}": float(one[name] - first[name])
+            for one, name in product(others, map(str, first))
+            if name in _USUAL[1:] or name.endswith(("_share", "_per_min", "_height_mm"))
+        }
+    return found
+
+
+def unit_of(measure: str, units: Mapping[str, str]) -> str:
+    """The unit of a measure; a difference of two periods has that of its column.
+
+    Args:
+        measure: a column of `collect`.
+        units: unit of every column of the sessions.
+    """
+    of = [name for name in units if "_minus_" in measure and measure.endswith(f"_{name}")]
+    return units.get(measure) or units.get(max(of, key=len, default=""), "")
 
 
 def _together(session: SessionTables) -> dict[str, Any]:
@@ -129,8 +157,8 @@ def _together(session: SessionTables) -> dict[str, Any]:
 
 
 def usual_measures(table: pd.DataFrame) -> list[str]:
-    """The default measures: the usual ones with values, the share of every action and zone, and
-    how often the animals of an arena interact.
+    """The default measures: the usual ones with values, the share of every action and zone, how
+    often the animals of an arena interact, and the differences of these between periods.
 
     Args:
         table: one row per session, see `collect`.
@@ -149,8 +177,16 @@ def usual_measures(table: pd.DataFrame) -> list[str]:
         for name in table.columns
         if str(name).startswith(PAIR) and str(name).endswith("_per_min")
     ]
+    changes = [  # between periods
+        str(name)
+        for name in table.columns
+        if "_minus_" in str(name)
+        and str(name).endswith(tuple(f"_{one}" for one in (*_USUAL, *shares)))
+    ]
     return [
-        name for name in (*_USUAL, *shares, *pairs) if name in table and table[name].notna().any()
+        name
+        for name in dict.fromkeys((*_USUAL, *shares, *pairs, *changes))
+        if name in table and table[name].notna().any()
     ]
 
 

@@ -34,7 +34,6 @@ from liex_lab.tables.schema import table_columns, to_pandas
 
 Array = NDArray[np.float64]
 
-TABLES = ("hours", "rhythm")
 FEWEST_DAYS = 3  # for measures of the regularity and the period of a rhythm
 _PERIODS_H = np.arange(18.0, 30.0, 0.05)
 _HOUR_S = 3600.0

@@ -8,7 +8,7 @@ frames only.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +33,8 @@ from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
 from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts, measure_bouts, of_known
 from liex_lab.behaviour.days import Light, activity_by_hour, rhythm
 from liex_lab.behaviour.kinematics import Joints, kinematics
+from liex_lab.errors import PlanError
+from liex_lab.plan.sections import BehaviourThresholds, Period
 from liex_lab.runtime.memory import Allocator
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import (
@@ -42,7 +44,6 @@ from liex_lab.tables.schema import (
     Vocabulary,
     empty_table,
     rears_of,
-    table_columns,
     to_pandas,
 )
 from liex_lab.tracking.track import DOUBTFUL, ends_of
@@ -68,7 +69,7 @@ class Behaviour:
         rules: the thresholds.
         vocabulary: determines the columns.
         actions: word of the ethogram -> its definition.
-        days: the tables of light and dark, `days.TABLES`; empty if the plan states no light.
+        stated: the tables of light and dark, and of periods, if the plan states them.
     """
 
     kinematics: pd.DataFrame
@@ -80,18 +81,18 @@ class Behaviour:
     rules: MouseRules
     vocabulary: Vocabulary
     actions: Mapping[str, str] = field(default_factory=dict)
-    days: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    stated: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     @property
     def tables(self) -> dict[str, pd.DataFrame]:
         """Every table by its name."""
-        return {name: getattr(self, name) for name in BEHAVIOUR} | dict(self.days)
+        return {name: getattr(self, name) for name in BEHAVIOUR} | dict(self.stated)
 
     @property
     def columns(self) -> tuple[Column, ...]:
         """The columns of the tables."""
-        of_days = [column for name in self.days for column in table_columns(name)]
-        return (*self.vocabulary.columns, *of_days)
+        stated = [column for name in self.stated for column in self.vocabulary.table(name)]
+        return (*self.vocabulary.columns, *stated)
 
     def for_session(self) -> dict[str, Any]:
         """The arguments for closing a session: `writer.close(**behaviour.for_session())`."""
@@ -99,7 +100,7 @@ class Behaviour:
             "results": self.tables,
             "columns": self.columns,
             "actions": self.actions,
-            "record": {"rules": self.rules.model_dump()},
+            "record": {"rules": self.rules.model_dump(exclude_none=True)},
         }
 
 
@@ -167,10 +168,12 @@ def measure(
     actions |= dict.fromkeys(sorted(set(named["action"]) - set(actions)), "")
     words = Vocabulary(tuple(actions), tuple(around.zones), kind_of(moved))
     gaps = empty_table(GAPS) if gaps is None else gaps
-    of_days = {}
+    stated = {}
     if around.light is not None:
         hours = activity_by_hour(moved, around.light, observed_hold(moved))
-        of_days = {"hours": hours, "rhythm": rhythm(hours, around.light)}
+        stated = {"hours": hours, "rhythm": rhythm(hours, around.light)}
+    if rules.periods:
+        stated["periods"] = by_period(frames, moved, named, words, around, rules)
     return Behaviour(
         moved,
         named,
@@ -181,7 +184,7 @@ def measure(
         rules,
         words,
         actions,
-        of_days,
+        stated,
     )
 
 
@@ -300,6 +303,67 @@ def summarise(
         step = kinematics["step_mm"].to_numpy(float)
         block["distance_moving_m"] = float(np.nansum(step[faster.to_numpy()])) / 1000.0
     return to_pandas(words.table("summary"), block)
+
+
+def by_period(
+    frames: pd.DataFrame,
+    kinematics: pd.DataFrame,
+    bouts: pd.DataFrame,
+    words: Vocabulary,
+    around: Surroundings,
+    rules: MouseRules,
+) -> pd.DataFrame:
+    """The table `periods`: the summary of each period that the plan states.
+
+    A bout across the border of a period is cut there, and counts on both sides.
+
+    Args:
+        frames: the table `frames`.
+        kinematics: the table `kinematics`.
+        bouts: the table `bouts` with its measures.
+        words: actions, zones and the kind of body.
+        around: arena, zones and water.
+        rules: its periods, and the pause threshold of `summarise`.
+
+    Raises:
+        PlanError: a period is not in the recording, see `frames_of_periods`.
+    """
+    rows = []
+    for period, own, stop_s in frames_of_periods(rules, kinematics["time_s"].to_numpy(float)):
+        within = bouts[
+            (bouts["start_s"] < stop_s - 1e-6) & (bouts["stop_s"] > period.start_s + 1e-6)
+        ]
+        cut = within[["start_s", "stop_s"]].clip(period.start_s, stop_s)
+        within = within.assign(**cut, duration_s=cut["stop_s"] - cut["start_s"])
+        row = summarise(frames[own], kinematics[own], within, words, around, rules)
+        rows.append(row.assign(period=period.name, start_s=period.start_s, stop_s=stop_s))
+    block = {str(name): values.to_numpy() for name, values in pd.concat(rows).items()}
+    return to_pandas(words.table("periods"), block)
+
+
+def frames_of_periods(
+    rules: BehaviourThresholds, time_s: Array
+) -> Iterator[tuple[Period, slice, float]]:
+    """Yield each period, its frames, and its end, s.
+
+    Args:
+        rules: the plan's `[behaviour]`.
+        time_s: (n,) times of the frames since the first one, s.
+
+    Raises:
+        PlanError: a period begins or ends after the recording, or has fewer than two frames.
+    """
+    end_s = float(stop_times(time_s)[-1])
+    for one in rules.periods or ():
+        stop_s = end_s if one.stop_s is None else one.stop_s
+        own = slice(*np.searchsorted(time_s, [one.start_s - 1e-6, stop_s - 1e-6]))
+        if own.stop - own.start < 2 or stop_s > end_s + 0.1:  # a length is rarely round
+            raise PlanError(
+                f"the period {one.name} of behaviour.periods, from {one.start_s:g} to {stop_s:g} "
+                f"s, should have frames and lie in the recording, which lasts {end_s:.6g} s; "
+                "correct its times, or leave it out"
+            )
+        yield one, own, min(stop_s, end_s)
 
 
 def _motion(kinematics: pd.DataFrame, hold: Array) -> dict[str, float]:

@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable
 from datetime import datetime
+from itertools import chain, pairwise
 from typing import Annotated, Any, ClassVar, Literal, Self
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -486,6 +487,14 @@ class SessionFacts(SubjectFacts):
         return moment.isoformat()
 
 
+class Period(SettingsTable):
+    """A named part of the recording; times count from the first frame."""
+
+    name: str = Field(pattern="^[a-z][a-z0-9_]{0,39}$", description="such as baseline")
+    start_s: NotNegative = Field(description="its beginning")
+    stop_s: Positive | None = Field(None, description="its end; not set: that of the recording")
+
+
 class BehaviourThresholds(SettingsTable):
     """[behaviour]: thresholds between behaviours. These are starting values; check them on your own
     animals.
@@ -543,6 +552,27 @@ class BehaviourThresholds(SettingsTable):
         description="length of the bins of the table activity; 0 is a minute, or a tenth of a "
         "recording of less than ten minutes",
     )
+    periods: list[Period] | None = Field(
+        None,
+        description=(
+            "states of one session, seconds since the first frame, as [{name = 'baseline', start_s "
+            "= 0, stop_s = 600}, {name = 'after', start_s = 900}]; each is measured on its own, "
+            "and compared with the first"
+        ),
+    )
+
+    @field_validator("periods")
+    @classmethod
+    def _apart(cls, periods: list[Period] | None) -> list[Period] | None:
+        if twice := first_twice(one.name for one in periods or ()):
+            raise ValueError(f"should have a name of its own for each period, and {twice} is twice")
+        spans = sorted(
+            (one.start_s, float("inf") if one.stop_s is None else one.stop_s)
+            for one in periods or ()
+        )
+        if any(one > after for one, after in pairwise(chain.from_iterable(spans))):
+            raise ValueError("should not overlap, and each should begin before it ends")
+        return periods
 
     @field_validator("bin_s")
     @classmethod

@@ -28,7 +28,7 @@ from liex_lab.errors import LiexError, SessionError, one_line, refuse
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan
-from liex_lab.plan.sections import Factor, SubjectFacts
+from liex_lab.plan.sections import Factor, Period, SubjectFacts
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.timestamps import Gap
 from liex_lab.runtime.durable import storable
@@ -435,7 +435,7 @@ class Document(_Section):
     model: _Model
     problems: list[str]
     actions: dict[str, str] = {}
-    rules: dict[str, Finite] | None = None
+    rules: dict[str, Finite | list[Period]] | None = None
     no_actions: str = ""
     thumbnails: list[_Thumbnail] = []
     whole_picture: _WholeImage | None = None

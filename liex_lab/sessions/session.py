@@ -57,6 +57,7 @@ FILES = {  # of a session, and whether every version writes it
     "activity.parquet": False,
     "hours.parquet": False,
     "rhythm.parquet": False,
+    "periods.parquet": False,
     "zones.parquet": False,
     "interactions.parquet": False,
     "interaction_totals.parquet": False,

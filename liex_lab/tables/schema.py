@@ -66,6 +66,8 @@ def _listed() -> dict[str, list[dict[str, str]]]:
     with Path(__file__).with_name("columns.csv").open(encoding="utf-8", newline="") as file:
         for line in csv.DictReader(file):
             tables.setdefault(line["table"], []).append(line)
+    # without the keys, and the frames and the length of the whole recording
+    tables["periods"] += [{**line, "table": "periods"} for line in tables["summary"][6:]]
     return tables
 
 
@@ -164,7 +166,7 @@ def all_columns() -> dict[str, Column]:
     tables = chain(
         *TABLES.values(), *SYNCED.values(), CROSSINGS, INTERACTIONS, EVENTS, DAYS, TRIGGERS, MOSEQ
     )
-    every = chain(tables, POINTS, branching, swimming, walking)
+    every = chain(tables, table_columns("periods"), POINTS, branching, swimming, walking)
     return {f"{c.table}.{c.name}": c for c in every}
 
 

@@ -4,7 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from liex_lab.behaviour import ACTIONS, measure
+from liex_lab.behaviour import ACTIONS, MouseRules, measure
+from liex_lab.behaviour.summary import frames_of_periods
+from liex_lab.errors import PlanError
+from liex_lab.plan import Plan
 from tests.behaviour.test_kinematics import tables_of
 from tests.sessions.walking_mouse import SPINE_MM, WalkingMouse, steady
 
@@ -95,3 +98,39 @@ def test_rears_with_and_without_a_wall_are_counted_together():
     assert row["rear_s"] == pytest.approx(1.5, abs=1e-6)
     assert row["rear_share"] == pytest.approx(0.15, abs=1e-6)
     assert row["rear_latency_s"] == pytest.approx(2.0, abs=1e-6)
+
+
+def test_periods_are_measured_as_the_session_is_and_add_up() -> None:
+    mouse = WalkingMouse(steady(10.0), speed_mm_s=200.0, rear_s=(4.0, 6.0))
+    plan = Plan().with_settings(
+        [
+            "behaviour.periods=[{name = 'before', start_s = 0, stop_s = 5},"
+            "{name = 'after', start_s = 5}]"
+        ]
+    )
+    assert Plan.from_toml(plan.to_toml()) == plan
+    whole = measure(*tables_of(mouse), MouseRules(**plan.behaviour.model_dump()))
+    row, periods = whole.summary.iloc[0], whole.tables["periods"].set_index("period")
+    assert periods[["start_s", "stop_s"]].to_numpy().ravel() == pytest.approx([0, 5, 5, 10])
+    for name in ("observed_s", "distance_m", "rear_s", "walk_s", "unlabelled_s"):
+        assert periods[name].sum() == pytest.approx(row[name], abs=1e-6), name
+    assert periods["rear_count"].tolist() == [1, 1], "the rear is cut"
+    assert periods["rear_mean_s"].sum() == pytest.approx(row["rear_mean_s"], abs=1e-6)
+    assert periods.loc["after", "rear_latency_s"] == 0.0
+    assert set(periods.columns) < {one.name for one in whole.columns} | {"session_id"}
+
+
+def test_periods_that_overlap_or_are_not_in_the_recording_are_refused() -> None:
+    for spans, match in (
+        ("{name = 'a', start_s = 0, stop_s = 5}, {name = 'b', start_s = 4}", "not overlap"),
+        ("{name = 'a', start_s = 0}, {name = 'b', start_s = 4}", "not overlap"),
+        ("{name = 'a', start_s = 5, stop_s = 4}", "begin before it ends"),
+        ("{name = 'a', start_s = 0, stop_s = 1}, {name = 'a', start_s = 4}", "a is twice"),
+        ("{name = 'A b', start_s = 0}", "should match pattern"),
+    ):
+        with pytest.raises(PlanError, match=match):
+            Plan().with_settings([f"behaviour.periods=[{spans}]"])
+    for span in ("start_s = 1, stop_s = 3", "start_s = 2.5"):
+        plan = Plan().with_settings([f"behaviour.periods=[{{name = 'late', {span}}}]"])
+        with pytest.raises(PlanError, match=r"the period late .* lie in the recording"):
+            list(frames_of_periods(plan.behaviour, steady(2.0)))

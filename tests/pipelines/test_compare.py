@@ -88,6 +88,24 @@ def test_rhythms_and_zones_are_compared_as_the_summary_is(study, tmp_path):
         compare([copied], tmp_path / "onset", ["m10_onset_h"])
 
 
+def test_each_period_is_compared_with_the_first_within_the_animal(study, tmp_path):
+    copied = shutil.copytree(study, tmp_path / "study")
+    columns = table_columns("periods")
+    for k, folder in enumerate(sorted(copied.glob("*/*.liex"))):
+        table = pd.DataFrame(columns=[one.name for one in columns], index=range(2)).assign(
+            session_id=f"s{k}", individual="animal_1", period=["baseline", "after"]
+        )
+        table["mean_speed_mm_s"] = [100.0 * k, 100.0 * k + 7.0 + (k >= 5) + 0.01 * k]
+        write_table(folder / "periods.parquet", columns, from_pandas(table), {})
+        facts = json.loads((folder / "session.json").read_text(encoding="utf-8"))["files"]
+        edit_json(folder, files=facts | {"periods.parquet": {"bytes": 1}})
+    stats = compare([copied], tmp_path / "out")["stats"].set_index("measure")
+    row = stats.loc["after_minus_baseline_mean_speed_mm_s"]
+    assert row["estimate"] == pytest.approx(1.05)
+    said = (tmp_path / "out" / "results.txt").read_text()
+    assert "After minus baseline mean speed was 0.105 cm/s higher in fast" in said
+
+
 def test_a_list_of_the_animals_overrules_the_sessions(study, tmp_path):
     table = tmp_path / "animals.csv"
     table.write_text(
