@@ -139,9 +139,9 @@ def _own_events(
             raise SessionError("of infrared images the mean of a patch counts; state it (--patch)")
         return time_s, "one event per frame"
 
-    def opened(where: str, plan: Plan, told: Progress) -> Recording:
+    def opened(where: str, plan: Plan, progress: Progress) -> Recording:
         stated = plan if infrared is None else plan.with_settings([f"recording.topic={infrared}"])
-        return open_planned(where, stated, told)
+        return open_planned(where, stated, progress)
 
     left, top, right, bottom = patch
     stamps_ns: list[int] = []

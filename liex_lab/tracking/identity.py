@@ -498,7 +498,7 @@ class OnlineIdentity:
     """Assigns the components of an ongoing recording's frames to animals, from the past alone.
 
     The forward pass of the model of `identify`, from the first frame on in which all stand apart.
-    An animal that was out of view is likely to be near where it was seen last. What is likeliest
+    An animal that was out of view is likely to be near where it was last in view. What is likeliest
     when a crossing has been over for half a second is taken as certain from there on.
 
     Attributes:
@@ -569,9 +569,9 @@ class OnlineIdentity:
             self._until_s, self.p_swap = -np.inf, 0.0
             self._cost[1:] = np.inf
             self._usual_px += (first.n_px[0, ::2][known].mean() - self._usual_px) / _SIZES
-        seen = np.flatnonzero(known[best])
-        self._last_s[seen] = now_s
-        to, of = ((2 * k[:, None] + (0, 1)).ravel() for k in (seen, best[seen]))
+        shown = np.flatnonzero(known[best])
+        self._last_s[shown] = now_s
+        to, of = ((2 * k[:, None] + (0, 1)).ravel() for k in (shown, best[shown]))
         self._last.times_ns[:] = first.times_ns
         for name in _OF_COMPONENTS:
             getattr(self._last, name)[:, to] = getattr(first, name)[:, of]
