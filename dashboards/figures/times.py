@@ -258,11 +258,10 @@ def distribution(
     known = np.isfinite(values)
     if not known.any():
         return None
-    values = values[known]
+    if not known.all():  # copies of a day are large
+        values, hold_s = values[known], hold_s[known]
     top = max(float(np.quantile(values, 0.99)), 1e-6)
-    share, edges = np.histogram(
-        np.minimum(values, top), bins=30, range=(0.0, top), weights=hold_s[known]
-    )
+    share, edges = np.histogram(np.minimum(values, top), bins=30, range=(0.0, top), weights=hold_s)
     share = 100.0 * share / max(share.sum(), 1e-9)
     title = f"{title}, {animal.label}\nn = {counted(len(values), 'frame')}"
     figure, axes = one_panel((ONE_COLUMN_MM, 52.0), _SMALL_BOX, title)
