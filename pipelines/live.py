@@ -262,14 +262,11 @@ def _chained(
 
 
 def _together(arrivals: Iterator[streaming.Arrival]) -> Iterator[list[streaming.Arrival]]:
-    """Batches of up to 16 frames that have waited; a fresh frame ends its batch.
-
-    A frame costs half as much in a batch.
-    """
+    """Batches of the frames that have arrived, up to 16: in a batch a frame costs half as much."""
     some: list[streaming.Arrival] = []
     for arrival in arrivals:
         some.append(arrival)
-        if len(some) == 16 or time.perf_counter() - arrival.at_s < 0.2:
+        if len(some) == 16 or not arrival.more:
             yield some
             some = []
     if some:

@@ -120,7 +120,7 @@ def _write(
     try:
         with McapDepthWriter(done.path, device.camera, messages="ros", metadata=facts) as writer:
             try:
-                for frame in read_ahead(device.frames):
+                for frame, _ in read_ahead(device.frames):
                     first_ns = first_ns or frame.time_ns
                     long_s = (frame.time_ns - first_ns) * 1e-9
                     if stop.is_set() or (seconds is not None and long_s >= seconds):

@@ -39,10 +39,12 @@ class Arrival(NamedTuple):
     Attributes:
         frame: the depth frame.
         at_s: its time of arrival, s, on the clock of `time.perf_counter`.
+        more: whether the next frame has arrived too.
     """
 
     frame: DepthFrame
     at_s: float
+    more: bool = False
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def _grown(
     while time.perf_counter() - last < patience_s:
         for index in range(done, len(opened)):
             last = time.perf_counter()
-            yield Arrival(opened.frame(index), last)
+            yield Arrival(opened.frame(index), last, index + 1 < len(opened))
         done = max(done, len(opened))
         time.sleep(_POLL_S)
         try:
@@ -158,7 +160,8 @@ def received(host: str, port: int) -> Arriving:
     with closing_on_error(link):
         name, camera = _greeting(link, where)
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    return Arriving(name, camera, read_ahead(_frames(link, camera, where)))
+    arrivals = read_ahead(_frames(link, camera, where))
+    return Arriving(name, camera, (one._replace(more=more) for one, more in arrivals))
 
 
 def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
@@ -184,8 +187,8 @@ def _greeting(link: socket.socket, where: str) -> tuple[str, Camera]:
     )
 
 
-def read_ahead(frames: Iterator[_Frame]) -> Iterator[_Frame]:
-    """The same frames, read on a separate thread, at most 128 ahead.
+def read_ahead(frames: Iterator[_Frame]) -> Iterator[tuple[_Frame, bool]]:
+    """The same frames, read on a separate thread, at most 128 ahead; and whether more are waiting.
 
     The time of a frame is then its arrival, not its request.
 
@@ -207,7 +210,7 @@ def read_ahead(frames: Iterator[_Frame]) -> Iterator[_Frame]:
     while (arrival := waiting.get()) is not None:
         if isinstance(arrival, RecordingError):
             raise arrival
-        yield arrival
+        yield arrival, not waiting.empty()
 
 
 def _send(server: socket.socket, recording: Recording, speed: float) -> None:

@@ -240,71 +240,70 @@ class JointTracker:
         """Cut components (q rows) into the parts of m animals each: m q rows, part by part; and
         whether (q,) they are so many animals.
         """
-        q = len(blobs.n_px)
-        labels, bodies = self._cuts(blobs, m)
+        q, n_bodies = len(blobs.n_px), len(self._bodies)
+        rows = np.arange(q)
         observed = self._observed(blobs)
-        cost, drawn = self._tried(blobs, observed, labels, bodies)
-        rows, best = np.arange(q), cost.argmin(axis=1)
-        kept_cost, kept, shown = cost[rows, best], labels[rows, best], drawn[rows, best]
+        cuts, of_cuts = self._cuts(blobs, m)
+        whole, of_whole, raised_mm = self._with_one_body(blobs, m)
+        n_cuts = cuts.shape[1]
+        labels = np.concatenate([cuts, whole], axis=1)
+        bodies = np.concatenate([of_cuts, of_whole], axis=1)
+        raised_mm = np.pad(raised_mm, ((0, 0), (n_cuts, 0)))
+        # all in one go, as a call costs as much as a frame
+        cost, drawn, shown = self._tried(blobs, observed, labels, bodies, raised_mm)
+        best = cost[:, :n_cuts].argmin(axis=1)
+        kept_cost, kept, shown = cost[rows, best], labels[rows, best], shown[rows, best]
         now = kept
         for _ in range(_SWEEPS):
-            now = self._owners(observed, shown, now)
-            again, fresh = self._tried(blobs, observed, now[:, None], bodies[rows, best][:, None])
+            now = self._owners(observed, drawn[shown], now)
+            again, drawn, fresh = self._tried(
+                blobs, observed, now[:, None], bodies[rows, best][:, None], np.zeros((q, 1))
+            )
             better = again[:, 0] < kept_cost
             kept_cost = np.where(better, again[:, 0], kept_cost)
             kept = np.where(better[:, None, None], now, kept)
             shown = fresh[:, 0]
-        alone, _ = self._tried(
-            blobs,
-            observed,
-            np.where(blobs.heights > 0, 0, -1)[:, None].repeat(len(self._bodies), axis=1),
-            np.tile(np.arange(len(self._bodies))[:, None], (q, 1, 1)),
-        )
-        several = kept_cost < _BETTER * alone.min(axis=1)
+        alone = cost[:, n_cuts : n_cuts + n_bodies].min(axis=1)
+        upper = n_cuts + n_bodies + cost[:, n_cuts + n_bodies :].argmin(axis=1)
+        on_top = _BETTER * cost[rows, upper] < kept_cost
         up_mm = np.zeros((m, q))
-        on_top = np.zeros(q, np.bool_)
-        if m == 2 and not self._camera_view:
-            upper, up_mm[0], cost = self._on_top(blobs, observed)
-            on_top = _BETTER * cost < kept_cost
-            up_mm[0, ~on_top] = 0.0
-            kept = np.where(on_top[:, None, None], upper, kept)
-        split = self._cut(blobs, kept, m, up_mm.ravel())
+        up_mm[0, on_top] = raised_mm[rows, upper][on_top]
+        kept = np.where(on_top[:, None, None], labels[rows, upper], kept)
+        mine = np.concatenate([kept == j for j in range(m)])
+        split = self._cut(HeightMaps.join([blobs] * m), mine, up_mm.ravel())
         enough = split.blobs.area_mm2.reshape(m, q) > 0.6 * self._least_mm2
         split.n_px[~enough.ravel()] = 0
-        return split, on_top | (several & enough.all(axis=0))
+        several = (kept_cost < _BETTER * alone) & enough.all(axis=0)
+        return split, on_top | several
 
-    def _on_top(
-        self, blobs: HeightMaps, observed: NDArray[np.float32]
-    ) -> tuple[Labels, Array, Array]:
-        """Explain components (q rows) by one animal on top of another one.
+    def _with_one_body(self, blobs: HeightMaps, m: int) -> tuple[Labels, NDArray[np.int64], Array]:
+        """Explain components (q rows) by one body, each of B in turn: all of it is one animal, or
+        shows an animal on top of another one, of which little is in view.
 
         The upper animal has the highest pixels, as many as usual, and is measured from so far above
         the floor that its mean height is the usual one.
 
         Returns:
-            Labels (q, S, S), 0 on the upper animal and 1 elsewhere; how far (q,) it is raised, mm;
-            and the cost (q,) of its body alone, infinite if it is not raised enough.
+            Labels (q, 2 B, S, S), 0 on the animal; the body (q, 2 B, m) of each part, -1 for none,
+            and how far (q, 2 B) the animal is raised, mm.
         """
-        q = len(blobs.n_px)
-        out = np.full(blobs.heights.shape, -1, np.int8)
-        up_mm, least = np.zeros(q), np.full(q, np.inf)
-        for body in self._bodies:
+        n_bodies = len(self._bodies)
+        labels = np.where(blobs.heights > 0, np.int8(0), np.int8(-1))[:, None]
+        labels = labels.repeat(2 * n_bodies, axis=1)
+        bodies = np.full((*labels.shape[:2], m), -1)
+        bodies[:, :n_bodies, 0] = np.arange(n_bodies)
+        up_mm = np.zeros(labels.shape[:2])
+        for k, body in enumerate(self._bodies if m == 2 and not self._camera_view else ()):
             usual_mm = self.heights_mm[self.trackers.index(body)]
             share = np.clip(1.0 - body.scene.area_mm2 / blobs.blobs.area_mm2, 0.0, 1.0)
-            labels, raised_mm = out.copy(), np.zeros(q)
             for i, heights in enumerate(blobs.heights):
                 inside = heights[heights > 0]
                 upper = inside >= np.quantile(inside, share[i])
-                labels[i, heights > 0] = np.where(upper, 0, 1)
-                raised_mm[i] = inside[upper].mean() / 16.0 - usual_mm
-            high = np.flatnonzero(raised_mm > _ON_TOP * usual_mm)
-            part = self._cut(blobs[high], labels[high], 1, raised_mm[high])
-            drawn = self._rendered(body, part)
-            cost = self._cost(observed[high, None], drawn[:, None, None])[:, 0]
-            better = high[cost < least[high]]
-            least[high] = np.minimum(cost, least[high])
-            out[better], up_mm[better] = labels[better], raised_mm[better]
-        return out, up_mm, least
+                raised_mm = inside[upper].mean() / 16.0 - usual_mm
+                if raised_mm > _ON_TOP * usual_mm:
+                    labels[i, n_bodies + k, heights > 0] = ~upper
+                    bodies[i, n_bodies + k, 0], up_mm[i, n_bodies + k] = k, raised_mm
+        return labels, bodies, up_mm
 
     def _cuts(self, blobs: HeightMaps, m: int) -> tuple[Labels, NDArray[np.int64]]:
         """Labels (q, P, S, S) of the parts in P ways of cutting, and the body (q, P, m) of each."""
@@ -333,24 +332,20 @@ class JointTracker:
             own[:, inside] = parts
         return labels, np.tile(bodies[chosen], (len(labels), n_ways, 1))
 
-    def _cut(
-        self, blobs: HeightMaps, labels: Labels, m: int, up_mm: Array | float = 0.0
-    ) -> HeightMaps:
-        """The height maps of the parts of components (q rows): m q rows, part by part, each
-        measured from up_mm (m q,) above the floor.
+    def _cut(self, parts: HeightMaps, mine: Mask, up_mm: Array) -> HeightMaps:
+        """The same height maps (k rows) without the pixels that are not `mine` (k, S, S), each
+        measured from up_mm (k,) above the floor; in place.
         """
-        parts = HeightMaps.join([blobs] * m)
-        mine = np.concatenate([labels == j for j in range(m)])
         parts.heights[~mine] = 0
         behind_mm = self.scene.view.behind_mm if self._camera_view else 0.0
-        lift = np.zeros(len(mine)) - up_mm
+        lift = -up_mm
         if self._camera_view:  # heights are measured from behind the middle of each part
             n_px = np.maximum(mine.sum(axis=(1, 2)), 1)
             lift += behind_mm - parts.heights.sum(axis=(1, 2)) / 16.0 / n_px
-        if lift.any():
-            raised = parts.heights + (16.0 * lift)[:, None, None]
-            parts.heights[:] = np.where(mine, np.maximum(raised, 1), 0)
-            parts.distance[:] += lift
+        moved = np.flatnonzero(lift)
+        raised = parts.heights[moved] + (16.0 * lift[moved])[:, None, None]
+        parts.heights[moved] = np.where(mine[moved], np.maximum(raised, 1), 0)
+        parts.distance[:] += lift
         camera = self.scene.camera
         in_parallel(
             _measure_parts,
@@ -369,24 +364,33 @@ class JointTracker:
         observed: NDArray[np.float32],
         labels: Labels,
         bodies: NDArray[np.int64],
-    ) -> tuple[Array, NDArray[np.float32]]:
-        """Cost (q, P) of explaining components (q rows), whose depth is `observed`, by the parts
-        `labels` (q, P, S, S), each with its body (q, P, m); and the rendered bodies (q, P, m, S, S)
-        mm.
+        raised_mm: Array,
+    ) -> tuple[Array, NDArray[np.float32], NDArray[np.int64]]:
+        """Explain components (q rows), whose depth is `observed`, in P ways, by the parts `labels`
+        (q, P, S, S), each with its body (q, P, m), -1 for none, the first of them raised (q, P) mm.
+
+        Returns:
+            The cost (q, P), infinite if a part has no pose; the rendered bodies (r, S, S) mm, the
+            last of them empty; and which of them (q, P, m) is that of each part.
         """
-        q, p, size = labels.shape[:3]
-        m = bodies.shape[2]
-        repeated = blobs[np.repeat(np.arange(q), p)]
-        parts = self._cut(repeated, labels.reshape(q * p, size, size), m)
-        which = bodies.reshape(q * p, m).T.ravel()
-        drawn = np.zeros((m * q * p, size, size), np.float32)
+        q, p, m = bodies.shape
+        ways = labels.reshape(q * p, *labels.shape[2:])
+        part, way = np.nonzero(bodies.reshape(q * p, m).T >= 0)
+        which = bodies.reshape(q * p, m)[way, part]
+        up_mm = np.where(part == 0, raised_mm.ravel()[way], 0.0)
+        parts = self._cut(blobs[way // p], ways[way] == part[:, None, None], up_mm)
+        drawn = np.zeros((len(way) + 1, *ways.shape[1:]), np.float32)
         for k, body in enumerate(self._bodies):
             rows = np.flatnonzero((which == k) & parts.found)
             drawn[rows] = self._rendered(body, parts[rows])
-        together = drawn.reshape(m, q, p, size, size).transpose(1, 2, 0, 3, 4)
-        cost = self._cost(observed[:, None], together)
-        missing = ~parts.found.reshape(m, q, p).all(axis=0)
-        return np.where(missing, np.inf, cost), together
+        shown = np.full((q * p, m), -1)
+        shown[way, part] = np.arange(len(way))
+        cost = np.empty(q * p)
+        most_mm = _MOST_OFF * float(np.sqrt(self.trackers[-1].scene.area_mm2))
+        in_parallel(_explained, q * p, observed, drawn, shown, most_mm, cost)
+        cost[way[~parts.found]] = np.inf
+        cost[(shown < 0).all(axis=1)] = np.inf
+        return cost.reshape(q, p), drawn, shown.reshape(q, p, m)
 
     def _rendered(self, body: FrameTracker, parts: HeightMaps) -> NDArray[np.float32]:
         """The best pose of a body in each part (k rows), rendered: (k, S, S) mm."""
@@ -414,16 +418,6 @@ class JointTracker:
         v = (blobs.origin[:, 1:] + pixel)[:, :, None]
         up = 1.0 - blobs.heights / 16.0 / blobs.distance[:, None, None]
         return np.where(blobs.heights > 0, up / (a * u + b * v + c), 0.0).astype(np.float32)
-
-    def _cost(self, observed: NDArray[np.float32], drawn: NDArray[np.float32]) -> Array:
-        """Cost (q, P) mm of rendered bodies (q, P, m, S, S) in depth (q, 1, S, S) mm."""
-        most = np.float32(_MOST_OFF * np.sqrt(self.trackers[-1].scene.area_mm2))
-        nearest = np.where(drawn > 0, drawn, np.inf).min(axis=2)
-        inside = observed > 0
-        off = np.where(inside, np.minimum(np.abs(nearest - observed), most), 0.0)
-        beside = most * (np.isfinite(nearest) & ~inside)
-        n_px = np.maximum(inside.sum(axis=(2, 3)), 1)
-        return np.asarray((off + beside).sum(axis=(2, 3)) / n_px)
 
     @staticmethod
     def _owners(
@@ -500,3 +494,26 @@ def _measure_parts(planes, intrinsics, rotation, behind_mm, crops, start, stop):
         if behind_mm > 0.0 and moments[N_PX] > 0:
             moments[SLOPE] = back_slope(heights, origin, step, intrinsics, distance, moments)
         crops.n_px[k] = int(moments[N_PX] * step * step)
+
+
+@kernel(nogil=True)
+def _explained(observed, drawn, shown, most_mm, out, start, stop):
+    """Fill the costs (q P,) of explaining depth (q, S, S) mm by rendered bodies (r, S, S) mm, those
+    numbered shown (q P, m), see the module.
+    """
+    n_ways = len(shown) // len(observed)
+    for k in range(start, stop):
+        depth = observed[k // n_ways]
+        cost, n_px = 0.0, 0
+        for v in range(depth.shape[0]):
+            for u in range(depth.shape[1]):
+                nearest = np.inf
+                for body in shown[k]:
+                    if drawn[body, v, u] > 0:
+                        nearest = min(nearest, drawn[body, v, u])
+                if depth[v, u] > 0:
+                    n_px += 1
+                    cost += min(abs(nearest - depth[v, u]), most_mm)
+                elif nearest < np.inf:
+                    cost += most_mm
+        out[k] = cost / max(n_px, 1)
