@@ -38,6 +38,7 @@ _STRETCH_SD = 0.04  # that of its mean over a stretch: 0.015 in virtual mice, wi
 _PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
 _MOST_NATS = 9.0  # of one frame
 _NOISE_MM = 0.3  # distance of a body from the depth below which there is no better one
+_MOST_MISFIT = np.log(2.0)  # of bodies in contact over that of free ones
 _INDEPENDENT_S = 0.1  # time after which the size of an outline is another one
 _UNCLEAR = 6.0  # difference of transition costs, nats, below which animals may be exchanged
 _OFF = 2.0  # nats, of a reading whose tag is two half lengths beyond the antenna's range
@@ -96,10 +97,13 @@ def identify(
         transition = moves[:, states[:, None, :], states[None, :, :]].sum(axis=-1)
         path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
         _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
-        path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
         bodies = np.stack([_misfit(one)[full] for one in observed])
-        sizes = emission = _sizes(observed[0][full], bodies, states[path], states)
-        path, _ = _viterbi(transition, emission)
+        apart, weight = _independent(observed[0][full])
+        fits = _fits(bodies, apart, weight, states)
+        path, _ = _viterbi(transition, fits)
+        size = np.log(np.maximum(observed[0].n_px[full, ::2], 1))
+        sizes = fits + _sizes(size, bodies, weight * apart, states[path], states)
+        path, _ = _viterbi(transition, emission := sizes)
         if readings is not None:
             places = observed[0].centroid_mm[full, ::2, :2].astype(float)
             read = readings.costs(observed[0].seconds[full], places, subjects[0].length_mm)
@@ -109,8 +113,8 @@ def identify(
         crossings = _crossings(observed[0], full, transition, by, path, states)
     for start, stop in _follow(observed, subjects[0].length_mm, slots, known):
         unclear = Crossing(start, stop, tuple(range(n_animals)), 0.5, "motion")
-        apart = [one for one in crossings if one.stop <= start or one.start >= stop]
-        crossings = tuple(sorted([*apart, unclear], key=lambda one: one.start))
+        others = [one for one in crossings if one.stop <= start or one.start >= stop]
+        crossings = tuple(sorted([*others, unclear], key=lambda one: one.start))
     return _by_bodies(observed, replace(marked, slots=slots, crossings=crossings))
 
 
@@ -332,48 +336,73 @@ def _misfit(observed: Observations) -> Array:
     return np.log(np.maximum(np.nan_to_num(observed.residual_mm[:, ::2], nan=1.0), _NOISE_MM))
 
 
-def _sizes(observed: Observations, bodies: Array, path: Slots, states: Slots) -> Array:
-    """Cost (m, S) of each assignment by the animals' bodies, or by their sizes, nats.
+def _independent(observed: Observations) -> tuple[NDArray[np.bool_], Array]:
+    """Whether (m,) the animals stand apart, and the weight (m,) of each frame's evidence.
 
-    Where the animals have bodies of their own, it is the sum of the logarithms of the distances of
-    these from the depth, as of exponentially distributed ones. Otherwise, the sizes of the animals,
-    the largest first, are the means of the ordered sizes of outlines in the stretches in which all
-    stand apart. One stretch errs alike throughout, by postures and places, so that its evidence has
-    a limit, and of sizes that differ little the order is chance:
-
-        cost = sum_k (x_k - u_k)^2 / (2 s^2) / (1 + n t^2 / s^2),
-        u = shrunk by sqrt(1 - t^2 / (2 var u)), n: independent outlines of the stretch.
-
-    Args:
-        observed: the m frames that show all animals.
-        bodies: (N, m, N) misfit of each animal's body and each component, see `_misfit`.
-        path: (m, N) an assignment of their components.
-        states: (S, N) the assignments.
+    One stretch, apart or in contact, errs alike throughout, by postures and places, so that its
+    evidence has a limit: its n independent frames weigh n / (1 + n t^2 / s^2).
     """
-    n_animals = states.shape[1]
+    n_animals = observed.score.shape[1] // 2
     apart = np.isfinite(observed.objects[..., 0]).sum(axis=1) >= n_animals
-    size = np.log(np.maximum(observed.n_px[:, ::2], 1))
-    size -= size.mean(axis=1, keepdims=True)
-    own = np.take_along_axis(size, path, axis=1)
     step_s = np.diff(observed.seconds, prepend=observed.seconds[0] - _INDEPENDENT_S)
     weight = np.minimum(step_s / _INDEPENDENT_S, 1.0)
-    usual, total = np.zeros(n_animals), 1e-9
-    shared = (_STRETCH_SD / _SIZE_SD) ** 2
     for start, stop in (*spans(apart), *spans(~apart)):
-        rows = slice(start, stop)
-        n = float(weight[rows].sum())
-        weight[rows] /= 1.0 + n * shared
-        if apart[start]:
-            usual += n / (1.0 + n * shared) * np.sort(own[rows].mean(axis=0))[::-1]
-            total += n / (1.0 + n * shared)
-    if (bodies != bodies[0]).any():
-        off = bodies[np.arange(n_animals), :, states].sum(axis=1).T
-        off = off - off.min(axis=1, keepdims=True)
-        return np.asarray(weight[:, None] * np.minimum(off, _MOST_NATS))
-    usual /= total
-    usual *= np.sqrt(max(0.0, 1.0 - 0.5 * _STRETCH_SD**2 / max(float(usual.var()), 1e-9)))
+        n = float(weight[start:stop].sum())
+        weight[start:stop] /= 1.0 + n * (_STRETCH_SD / _SIZE_SD) ** 2
+    return apart, weight
+
+
+def _fits(bodies: Array, apart: NDArray[np.bool_], weight: Array, states: Slots) -> Array:
+    """Cost (m, S) of each assignment by the bodies of the animals, nats.
+
+    It is the sum of the logarithms of their distances from the depth, as of exponentially
+    distributed ones. Where no assignment fits about as well as apart, outlines were cut in a wrong
+    place, and show nothing.
+
+    Args:
+        bodies: (N, m, N) misfit of each animal's body and each component, see `_misfit`.
+        apart: (m,) whether the animals stand apart.
+        weight: (m,) weight of each frame.
+        states: (S, N) the assignments.
+    """
+    cost = bodies[np.arange(len(bodies)), :, states].sum(axis=1).T
+    least = cost.min(axis=1)
+    usual = finite_median(least[apart], -np.inf)
+    right = least < usual + len(bodies) * _MOST_MISFIT
+    return np.asarray((weight * right)[:, None] * np.minimum(cost - least[:, None], _MOST_NATS))
+
+
+def _sizes(size: Array, bodies: Array, weight: Array, path: Slots, states: Slots) -> Array:
+    """Cost (m, S) of each assignment by the sizes of outlines, nats.
+
+    The usual sizes u of the animals are the means over the stretches in which all stand apart, of
+    animals with one body the largest first in each. Of sizes that differ little that order is
+    chance, so that u is shrunk towards their mean by sqrt(1 - t^2 / (2 var u)):
+
+        cost = w sum_k (x_k - u_k)^2 / (2 s^2).
+
+    Args:
+        size: (m, N) logarithm of the pixels of each component.
+        bodies: (N, m, N) misfit of each animal's body and each component, see `_misfit`.
+        weight: (m,) weight w of each frame, 0 where the animals do not stand apart.
+        path: (m, N) an assignment of the components.
+        states: (S, N) the assignments.
+    """
+    size = size - size.mean(axis=1, keepdims=True)
+    own = np.take_along_axis(size, path, axis=1)
+    alike = {tuple(np.flatnonzero((bodies == one).all(axis=(1, 2)))) for one in bodies}
+    usual = np.zeros(states.shape[1])
+    for start, stop in spans(weight > 0.0):
+        mean = own[start:stop].mean(axis=0)
+        for some in map(list, alike):
+            usual[some] += weight[start:stop].sum() * np.sort(mean[some])[::-1]
+    usual /= max(float(weight.sum()), 1e-9)
+    for some in map(list, alike):
+        off = usual[some] - usual[some].mean()
+        chance = 0.5 * _STRETCH_SD**2 / max(float(off.var()), 1e-9)
+        usual[some] -= off * (1.0 - np.sqrt(max(0.0, 1.0 - chance)))
     off = ((size[:, states] - usual) / _SIZE_SD) ** 2
-    return np.asarray((weight * apart)[:, None] * np.minimum(0.5 * off.sum(axis=-1), _MOST_NATS))
+    return np.asarray(weight[:, None] * np.minimum(0.5 * off.sum(axis=-1), _MOST_NATS))
 
 
 def _viterbi(transition: Array, emission: Array) -> tuple[Slots, float]:

@@ -110,20 +110,26 @@ def test_an_animal_that_enters_leaves_or_hides_does_not_take_the_name_of_the_oth
     assert (found.slots[away, 1 - first] == -1).all() or not sure[away].all()
 
 
+@pytest.mark.parametrize("beside", [0, 1])  # animals of another body
 @pytest.mark.parametrize("ratio", [1.0, 1.04, 1.15, 1.5])
 def test_an_exchange_that_nothing_decides_is_as_likely_as_not_and_sizes_decide_it(
-    ratio: float,
+    ratio: float, beside: int
 ) -> None:
-    order = np.tile([0, 1], (len(SECONDS), 1))
-    seen = mixed(2, order)
+    order = np.tile(np.arange(2 + beside), (len(SECONDS), 1))
+    seen = mixed(2 + beside, order)
     lose(seen, LOST)
     later = slice(LOST.stop, None)
     middle = 0.5 * (seen.place[:, :1] + seen.place[:, 2:3])
     apart = np.clip(np.abs(np.arange(len(SECONDS)) - 47.0) / 400.0, 0.0, 1.0)  # they meet slowly
-    seen.place[:] = middle + apart[:, None, None] * (seen.place - middle)
+    seen.place[:, :4] = middle + apart[:, None, None] * (seen.place[:, :4] - middle)
+    seen.place[:, 4:] += 500.0
     seen.centroid_mm[:] = seen.place
     seen.n_px[:, :2] = round(800 * ratio)
-    found = identify([seen] * 2, [SUBJECT] * 2)
+    every = [replace(seen, residual_mm=seen.residual_mm.copy()) for _ in range(2 + beside)]
+    for k, one in enumerate(every):
+        fits = (np.arange(2 + beside) < 2) == (k < 2)
+        one.residual_mm[:] = np.repeat(np.where(fits, 1.0, 3.0), 2)
+    found = identify(every, [SUBJECT] * (2 + beside))
     unclear = max(found.crossings, key=lambda one: one.p_swap)
     if ratio < 1.1:  # it may be by chance
         assert 0.2 < unclear.p_swap <= 0.5
