@@ -4,8 +4,6 @@ Each job is a `liex doctor` or `liex run` in a process of its own; what it print
 its progress. Paths are relative to the folder and never leave it, and links are refused.
 """
 
-from __future__ import annotations
-
 import subprocess
 import threading
 from pathlib import Path

@@ -11,8 +11,6 @@ learned from it as from whole frames; pixels outside become unread. The archive 
 of its times and depths.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -524,7 +522,7 @@ def _camera_of(recording: Recording) -> Sequence[Any]:
     return [camera.matrix.tolist(), camera.width, camera.height, camera.distortion]
 
 
-def _hash_frame(whole: hashlib._Hash, step_mm: float, time_ns: int, depth: Depth) -> None:
+def _hash_frame(whole: "hashlib._Hash", step_mm: float, time_ns: int, depth: Depth) -> None:
     """Add a frame to the SHA-256 of times and depth in steps; see `PackFacts.depth_sha256`."""
     steps = np.rint(depth / np.float32(step_mm)).astype("<u2")
     whole.update(np.int64(time_ns).astype("<i8").tobytes())

@@ -1,7 +1,5 @@
 """Animals of a session for figures and pages: rows of the tables, names, and depth images."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
@@ -92,7 +90,7 @@ class SessionAnimal:
         return self.rows_of(self.session.table(name)) if known else None
 
     @cached_property
-    def summary(self) -> pd.Series[float] | None:
+    def summary(self) -> "pd.Series[float] | None":
         """Its row of the summary; None if absent."""
         if not self.session.has("summary.csv"):
             return None
@@ -126,7 +124,7 @@ class SessionAnimal:
             return np.full(len(self.frames), np.nan)
         return self.broken(self.kinematics[name])
 
-    def broken(self, values: pd.Series[float]) -> Array:
+    def broken(self, values: "pd.Series[float]") -> Array:
         """Values of every frame, with NaN for the first one after a gap of the camera."""
         return np.where(self.frames["gap_before"].to_numpy() == 0, values.to_numpy(float), np.nan)
 

@@ -7,8 +7,6 @@ scale multiplies all of them. A skeleton is data, so an animal is added without 
 define the tree, [view] how the animal is viewed, and [surface] the body around the bones.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Sequence
@@ -67,7 +65,7 @@ class CameraView:
     foreground: str = FOREGROUNDS[0]
 
     @staticmethod
-    def from_table(table: dict[str, Any], relative_size: float, origin: str) -> CameraView:
+    def from_table(table: dict[str, Any], relative_size: float, origin: str) -> "CameraView":
         """The view stated in a TOML; omitted values are derived from the animal's size.
 
         Args:
@@ -163,7 +161,7 @@ class Skeleton:
         )
 
     @staticmethod
-    def load(animal: str | Path) -> Skeleton:
+    def load(animal: str | Path) -> "Skeleton":
         """The skeleton of a preset or of a user's TOML file.
 
         Args:
@@ -191,7 +189,7 @@ class Skeleton:
         return Skeleton.from_table(_with_mesh(table, path), str(path))
 
     @staticmethod
-    def from_table(table: dict[str, Any], origin: str) -> Skeleton:
+    def from_table(table: dict[str, Any], origin: str) -> "Skeleton":
         """A skeleton from the content of its TOML.
 
         Args:

@@ -11,8 +11,6 @@ with S the stated deviations in the frame R of the bone that carries the point, 
 of the joints, and w_j the weights of linear interpolation along the spine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -18,8 +18,6 @@ starts along the principal axis of the foreground in both directions, with small
 initialisation), which needs fewer initial poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -85,7 +83,7 @@ class Candidates:
         position: Array,
         scale: Array,
         size: Array,
-    ) -> Candidates:
+    ) -> "Candidates":
         """Make candidates with only the base in place.
 
         Args:
@@ -323,7 +321,7 @@ class Cascade:
             )
 
     def labels(
-        self, candidates: Candidates, joint: int, truth: Truth
+        self, candidates: Candidates, joint: int, truth: "Truth"
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Corrections from the candidates to the truth, and the samples to learn from.
 

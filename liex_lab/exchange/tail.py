@@ -16,8 +16,6 @@ B and W were fitted to virtual mice, so that the tail lies within 30 degrees of 
 direction with the stated probability.
 """
 
-from __future__ import annotations
-
 from itertools import chain
 from typing import NamedTuple
 

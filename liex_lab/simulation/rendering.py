@@ -1,7 +1,5 @@
 """Depth images of labelled meshes before a still scene, through a sensor, on all threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -41,7 +39,7 @@ class Solid(Rows):
         faces: NDArray[np.int32],
         shown: NDArray[np.bool_] | None = None,
         label: int = OBJECT,
-    ) -> Solid:
+    ) -> "Solid":
         """A mesh with its own shape in every frame, or one that only appears and disappears.
 
         Args:
@@ -81,7 +79,7 @@ class Views(Rows):
     floor: Array
 
     @staticmethod
-    def of(camera: Camera, T_arena_camera: SE3, parameters: Array, ground: Array) -> Views:
+    def of(camera: Camera, T_arena_camera: SE3, parameters: Array, ground: Array) -> "Views":
         """One camera n times."""
         n = len(parameters)
         intrinsics = np.tile(camera.intrinsics, (n, 1))

@@ -6,8 +6,6 @@ in any order. `MouseSpecies` is the mouse, `FishSpecies` the zebrafish, `Generic
 with a skeleton.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -480,7 +478,7 @@ class GenericSpecies(Species):
     """
 
     @staticmethod
-    def of(skeleton: Skeleton) -> GenericSpecies:
+    def of(skeleton: Skeleton) -> "GenericSpecies":
         """The species of a skeleton: visible by the Raytrix R5 below 35 mm of length, in a scene in
         which the whole animal is visible from anywhere, at a sufficient size.
         """

@@ -6,8 +6,6 @@ labelled frames of a person of the NYU Hand Pose data set (Tompson et al. 2014) 
 available.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ Body, posture and path of an animal are drawn from the seed alone, not from the 
 animal behaves the same in every scene of a seed, as far as the arena permits.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
