@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Mask
 from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingError, refuse
 from liex_lab.optics.camera import Lens
 from liex_lab.plan import Plan
@@ -234,9 +234,6 @@ def in_place(target: Path) -> Iterator[Path]:
 
 
 # Lossless archives of recordings, `liex pack`: 16-bit depth of the arena as RVL in an MCAP file.
-
-
-Mask = NDArray[np.bool_]
 
 
 def pack(

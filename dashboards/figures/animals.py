@@ -10,13 +10,12 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.activity import hold_times
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session, cutouts
 
-Array = NDArray[np.float64]
 Held = TypeVar("Held")
 # the drawn columns, beyond those of every table
 FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")

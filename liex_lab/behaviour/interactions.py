@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import INTERACTIONS as WORDS
+from liex_lab.arrays import Array, Mask, NDArray
 from liex_lab.behaviour.body import SWIMS, BodyAxis
 from liex_lab.behaviour.bouts import hysteresis, tidy
 from liex_lab.behaviour.kinematics import neighbours, segments
@@ -42,9 +42,6 @@ from liex_lab.runtime.memory import blocks
 from liex_lab.tables.rows import Rows, frame_count, stop_times
 from liex_lab.tables.schema import INTERACTIONS, to_pandas
 from liex_lab.tracking.track import CORRECTED, Track, whole_gaps
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _ALONG = np.linspace(0.0, 1.0, 13)  # places along the body, from the front (0) to the rear (1)
 _TRUNK = _ALONG >= 0.25  # behind the head

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
+from liex_lab.arrays import Array
 from liex_lab.behaviour.activity import (
     Surroundings,
     activity,
@@ -46,8 +46,6 @@ from liex_lab.tables.schema import (
     to_pandas,
 )
 from liex_lab.tracking.track import DOUBTFUL, ends_of
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

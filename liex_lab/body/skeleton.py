@@ -7,6 +7,8 @@ scale multiplies all of them. A skeleton is data, so an animal is added without 
 define the tree, [view] how the animal is viewed, and [surface] the body around the bones.
 """
 
+from __future__ import annotations
+
 import difflib
 import math
 from collections.abc import Sequence
@@ -16,13 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, how_to_install, refuse
 from liex_lab.geometry import so3
 from liex_lab.runtime.text_files import read_toml
-
-Array = NDArray[np.float64]
 
 AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the joint's own frame
 PRESETS = Path(__file__).parent / "presets"
@@ -65,7 +65,7 @@ class CameraView:
     foreground: str = FOREGROUNDS[0]
 
     @staticmethod
-    def from_table(table: dict[str, Any], relative_size: float, origin: str) -> "CameraView":
+    def from_table(table: dict[str, Any], relative_size: float, origin: str) -> CameraView:
         """The view stated in a TOML; omitted values are derived from the animal's size.
 
         Args:
@@ -161,7 +161,7 @@ class Skeleton:
         )
 
     @staticmethod
-    def load(animal: str | Path) -> "Skeleton":
+    def load(animal: str | Path) -> Skeleton:
         """The skeleton of a preset or of a user's TOML file.
 
         Args:
@@ -189,7 +189,7 @@ class Skeleton:
         return Skeleton.from_table(_with_mesh(table, path), str(path))
 
     @staticmethod
-    def from_table(table: dict[str, Any], origin: str) -> "Skeleton":
+    def from_table(table: dict[str, Any], origin: str) -> Skeleton:
         """A skeleton from the content of its TOML.
 
         Args:

@@ -23,9 +23,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import KinematicTree, aim
 from liex_lab.body.shape import Spheres
 from liex_lab.body.skeleton import REFERENCE_MM, Skeleton
@@ -42,8 +42,6 @@ from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene._blob_kernels import N_MOMENTS
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 from liex_lab.scene.height_maps import moment_columns
-
-Array = NDArray[np.float64]
 
 
 @dataclass

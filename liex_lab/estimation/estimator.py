@@ -12,6 +12,8 @@ a ridge correction or a Gauss-Newton refinement, depending on the method. `PoseE
 public class.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -93,7 +95,7 @@ class Detection(Rows):
         """(n,) bool: there is a component in the frame, and a candidate for it."""
         return self.crops.found & np.isfinite(self.scores).any(axis=1)
 
-    def opposite(self, tip: int) -> "Detection":
+    def opposite(self, tip: int) -> Detection:
         """Keep only the candidates that point away from the best one, base to tip.
 
         Excluded candidates take the positions of the best remaining one, so that the number of
@@ -140,7 +142,7 @@ class PoseEstimator:
     start_seed: int = 20170125
 
     @staticmethod
-    def load(name: str | Path = "mouse") -> "PoseEstimator":
+    def load(name: str | Path = "mouse") -> PoseEstimator:
         """Load an estimator, with the number of candidates of its method.
 
         Args:

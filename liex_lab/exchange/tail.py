@@ -23,9 +23,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from liex_lab.arrays import Array
 from liex_lab.sessions import Session
 from liex_lab.sessions.cutouts import Kept, meant_to_keep_depth, open_depth, still_scene
-from liex_lab.sessions.session import Array
 from liex_lab.tables.rows import median_step
 
 TAIL = "tail_30mm"

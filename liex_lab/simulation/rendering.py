@@ -4,16 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.simulation import _render_kernels as kernels
 from liex_lab.simulation._sensor_kernels import NORMAL, OBJECT
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, BodyShape, Surface
 from liex_lab.body.skeleton import VIEWS, Skeleton
@@ -61,8 +61,6 @@ from liex_lab.simulation.scene import (
 )
 from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, SENSORS, Sensor, draw_units, unseen
 from liex_lab.simulation.training_patches import PER_SESSION, TrainingPatches
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from liex_lab.arrays import Array
 from liex_lab.behaviour.interactions import Individual, find_interactions
 from liex_lab.errors import LiexError
 from liex_lab.evaluation.scores import error_of
@@ -40,8 +40,6 @@ from liex_lab.tracking.track import spans
 
 from ..build import plan_of
 from .scenes import run_product
-
-Array = NDArray[np.float64]
 
 SEEDS: Final = tuple(range(2001, 2049))
 SEALED_SEEDS: Final = tuple(range(958_311_701, 958_311_749))

@@ -5,15 +5,13 @@ animal behaves the same in every scene of a seed, as far as the arena permits.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.shape import Surface
 from liex_lab.simulation.locomotion import Path, Script, free_path, smoothed, walk, waver
 from liex_lab.simulation.recording import Actor, Take
 from liex_lab.simulation.scene import SimulatedScene
 from liex_lab.simulation.species import MouseSpecies
-
-Array = NDArray[np.float64]
 
 _RATE_HZ = 30.0
 _TRIES = 60
