@@ -198,7 +198,7 @@ def _figures(counts: Counts) -> dict[str, Any]:
         return counts[of] / counts[per] if counts.get(per) else None
 
     hours = counts["contact_s"] / 3600.0
-    figures = {
+    figures: dict[str, Any] = {
         "swaps": int(counts["swaps"]),
         "swaps_per_contact_hour": counts["swaps"] / hours if hours else None,
         **track_figures(counts),
