@@ -11,11 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.runtime.processes import serial_products
-
-Array = NDArray[np.float64]
 
 _AT_ONCE = 2048  # samples in memory
 LIMIT = 6.0  # standard deviations at which features are clipped

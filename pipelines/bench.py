@@ -1,20 +1,32 @@
-"""Recordings below one folder, examined and measured for the dashboard: one at a time.
+"""The dashboard, and the recordings below its folder: examined and measured one at a time.
 
 Each job is a `liex doctor` or `liex run` in a process of its own; what it prints and its log are
 its progress. Paths are relative to the folder and never leave it, and links are refused.
 """
 
-from __future__ import annotations
-
+import secrets
 import subprocess
 import threading
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from liex_lab.errors import PlaceError, RecordingError
+from liex_lab.dashboards.app.data import StudyData
+from liex_lab.dashboards.report.report import write_views
+
+from liex_lab.errors import MissingPackageError, PlaceError, RecordingError, how_to_install
 from liex_lab.plan import known_plans
 from liex_lab.runtime import durable
 from liex_lab.runtime.processes import own_python
+from liex_lab.runtime.progress import Progress, silent
+from liex_lab.sessions.review import FOLDER
+from liex_lab.sessions.viewer import show_replay
+
+from .correct import correct_session
+from .region_config import StatedRegions
+from .study.run import list_sessions
+from .training.action_model import suggest
 
 _RECORDINGS = (".mcap", ".bag", ".db3", ".oni", ".avi", ".mkv", ".gz", ".dat", ".tif", ".tiff")
 _MOST = 500  # entries of a folder that are listed
@@ -141,3 +153,53 @@ class Bench:
             "running": code is None,
             "code": code,
         }
+
+
+def serve_dashboard(
+    study: str | Path,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8050,
+    echo: Callable[[str], None] = print,
+    progress: Progress = silent,
+) -> None:
+    """Serve a study, or a folder that contains sessions, to browsers until interrupted.
+
+    Access requires a token, new for each start, which is part of the address. Replays can be opened
+    only if the server listens on this machine alone.
+
+    Args:
+        study: a study file, its folder, or a folder that contains sessions.
+        host: the network address to listen on; the default is this machine alone.
+        port: the port to listen on.
+        echo: called with the dashboard's address once it is served.
+        progress: receives progress while sessions are loaded.
+
+    Raises:
+        MissingPackageError: the extra `dashboard` is not installed.
+        StudyError: there is no such study.
+    """
+    try:
+        from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(
+            f"the dashboard needs {error.name}; {how_to_install('dashboard')}"
+        ) from None
+    place = Path(study) if Path(study).is_dir() else Path(study).parent
+    data = StudyData(*list_sessions(study))
+    data.warm(progress)
+    alone = host in LOOPBACK
+    token = secrets.token_urlsafe(24)
+    app = make_app(
+        data,
+        token=token,
+        alone=alone,
+        show_replay=show_replay if alone else None,
+        correct=partial(correct_session, report=False),
+        report=write_views,
+        suggest=suggest,
+        reviews=place / FOLDER,
+        regions=StatedRegions(study),
+        measuring=Bench(place.resolve()) if alone else None,
+    )
+    serve(app, host, port, lambda found: echo(address(host, found, token)))

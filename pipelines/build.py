@@ -4,13 +4,14 @@ Only this module turns names and numbers of a plan into objects of the library (
 Errors in the plan are raised before any work is done.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from liex_lab.actions import storage, timeline
 from liex_lab.behaviour import activity, bouts
@@ -47,10 +48,6 @@ from liex_lab.sessions import Provenance, cutouts
 from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.own_shape import StatedShape
 from liex_lab.tracking.tracker import FrameTracker
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 def animal_of(plan: Plan) -> sections.AnimalSettings:

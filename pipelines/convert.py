@@ -11,8 +11,6 @@ learned from it as from whole frames; pixels outside become unread. The archive 
 of its times and depths.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -22,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Mask
 from liex_lab.errors import EstimationError, LiexError, ModelError, RecordingError, refuse
 from liex_lab.optics.camera import Lens
 from liex_lab.plan import Plan
@@ -236,9 +234,6 @@ def in_place(target: Path) -> Iterator[Path]:
 
 
 # Lossless archives of recordings, `liex pack`: 16-bit depth of the arena as RVL in an MCAP file.
-
-
-Mask = NDArray[np.bool_]
 
 
 def pack(
@@ -524,7 +519,7 @@ def _camera_of(recording: Recording) -> Sequence[Any]:
     return [camera.matrix.tolist(), camera.width, camera.height, camera.distortion]
 
 
-def _hash_frame(whole: hashlib._Hash, step_mm: float, time_ns: int, depth: Depth) -> None:
+def _hash_frame(whole: "hashlib._Hash", step_mm: float, time_ns: int, depth: Depth) -> None:
     """Add a frame to the SHA-256 of times and depth in steps; see `PackFacts.depth_sha256`."""
     steps = np.rint(depth / np.float32(step_mm)).astype("<u2")
     whole.update(np.int64(time_ns).astype("<i8").tobytes())

@@ -6,8 +6,6 @@ of their own lie on the curve through the others, a monotone cubic over their pl
 (Fritsch and Carlson 1980).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ wait. The file is complete when it ends by itself, by Ctrl-C or with the camera'
 was cut off, by a full disk or the power, keeps all but its last frame, or 128 kB of small frames.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass, field
 from pathlib import Path

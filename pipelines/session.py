@@ -11,8 +11,6 @@ have folders of their own until they are appended in order: an interruption cost
 progress.
 """
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
@@ -22,11 +20,13 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+import pandas as pd
 from liex_lab.dashboards.replay.layouts import replay_blueprint
 from liex_lab.dashboards.report.report import write_views
+from numpy.typing import NDArray
 
 from liex_lab.actions import ethogram, timeline, vocabulary
 from liex_lab.behaviour import summary
@@ -83,11 +83,6 @@ from .build import (
 )
 from .choice import USUAL, Fitted, fit_plan
 from .compiling import compile_ahead
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from numpy.typing import NDArray
-
 
 LENGTH = 500  # frames per shard: some seconds of work, the cost of an interruption
 CHUNK = 32  # frames in memory at a time

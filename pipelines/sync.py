@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array
 from liex_lab.errors import SessionError
 from liex_lab.exchange.clocks import Alignment, align, align_pairs, check_times
 from liex_lab.exchange.pulses import read_pulses, rises
@@ -22,7 +22,6 @@ from .build import open_planned
 from .correct import correct_session
 from .drawing import recording_of
 
-Array = NDArray[np.float64]
 Patch = tuple[int, int, int, int]
 _KEPT = 200  # parts of a session, of each of which two residuals are kept
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from flask import Response, request
 
+from liex_lab.arrays import Array
 from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.sessions import correcting, corrections
 from liex_lab.sessions.review import (
@@ -29,7 +30,6 @@ from liex_lab.sessions.review import (
     write_review,
 )
 
-from ..figures.animals import Array
 from .data import StudyData
 from .desk import Desk, Stretch, coloured_actions
 

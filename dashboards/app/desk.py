@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import action_colours
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.kinematics import IMPOSSIBLE_MM_S
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session, correcting, corrections, evidence
 from liex_lab.tracking.track import DOUBTFUL
 
-from ..figures.animals import Array, DepthImages, SessionAnimal
+from ..figures.animals import DepthImages, SessionAnimal
 from ..report.contact_sheet import png
 from ..video.film import Footage
 from .tables import records

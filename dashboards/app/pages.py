@@ -3,8 +3,6 @@
 The statistics come from `liex_lab.behaviour.cohort`, the figures from `..figures`.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -397,7 +395,7 @@ def _bars(
 
 
 def _shares(
-    row: pd.Series[float], words: Sequence[str], coloured: Mapping[str, str]
+    row: "pd.Series[float]", words: Sequence[str], coloured: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """One row of the time budget, in %; actions without their own colour are merged."""
     parts: dict[str, float] = {}

@@ -3,8 +3,6 @@
 CSV cells that a spreadsheet would read as a formula are escaped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -294,7 +292,7 @@ def records(rows: pd.DataFrame) -> list[dict[str, Any]]:
     return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
 
-def _places(values: pd.Series[Any]) -> int | None:
+def _places(values: "pd.Series[Any]") -> int | None:
     """Decimals for a column: three significant digits of its median, at most four decimals.
 
     None if the column is not numeric, or contains p values or estimates of many measures.

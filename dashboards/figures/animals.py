@@ -1,7 +1,5 @@
 """Animals of a session for figures and pages: rows of the tables, names, and depth images."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import ExitStack
@@ -12,13 +10,12 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.activity import hold_times
 from liex_lab.errors import LiexError
 from liex_lab.sessions import Session, cutouts
 
-Array = NDArray[np.float64]
 Held = TypeVar("Held")
 # the drawn columns, beyond those of every table
 FRAMES = ("frame_index", "time_s", "gap_before", "predicted_error_mm", "spine_mm")
@@ -92,7 +89,7 @@ class SessionAnimal:
         return self.rows_of(self.session.table(name)) if known else None
 
     @cached_property
-    def summary(self) -> pd.Series[float] | None:
+    def summary(self) -> "pd.Series[float] | None":
         """Its row of the summary; None if absent."""
         if not self.session.has("summary.csv"):
             return None
@@ -126,7 +123,7 @@ class SessionAnimal:
             return np.full(len(self.frames), np.nan)
         return self.broken(self.kinematics[name])
 
-    def broken(self, values: pd.Series[float]) -> Array:
+    def broken(self, values: "pd.Series[float]") -> Array:
         """Values of every frame, with NaN for the first one after a gap of the camera."""
         return np.where(self.frames["gap_before"].to_numpy() == 0, values.to_numpy(float), np.nan)
 

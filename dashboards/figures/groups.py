@@ -2,8 +2,6 @@
 animals.
 """
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -471,7 +469,7 @@ def _added(some: Sequence[Occupancy]) -> Occupancy:
     )
 
 
-def _budget(sessions: Sequence[SessionAnimal], words: Sequence[str]) -> pd.Series[float]:
+def _budget(sessions: Sequence[SessionAnimal], words: Sequence[str]) -> "pd.Series[float]":
     """Share of a subject's time in each action: the mean of its sessions; NaN if unknown."""
     known = [dict(animal.summary) for animal in sessions if animal.summary is not None]
     return pd.DataFrame(known, columns=[f"{word}_share" for word in words], dtype=float).mean()

@@ -9,15 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.activity import Occupancy, occupancy
 from liex_lab.behaviour.body import BRANCHES, axis_of
 from liex_lab.scene.scene import Fixture
 from liex_lab.sessions import Session
 
 from ..units import counted
-from .animals import Array, SessionAnimal
+from .animals import SessionAnimal
 from .style import (
     INK,
     MUTED,

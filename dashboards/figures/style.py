@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from .animals import Array
+from liex_lab.arrays import Array
 
 FORMATS = ("svg", "pdf", "png")
 ONE_COLUMN_MM = 89.0

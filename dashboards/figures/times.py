@@ -7,14 +7,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Rectangle
-from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import PREDICTED_ERROR, UNLABELLED_COLOUR, action_colours
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.activity import Around, around_onsets, hold_times
 from liex_lab.behaviour.body import DrawnMeasure, drawn_measures
 
 from ..units import counted, shown
-from .animals import Array, SessionAnimal
+from .animals import SessionAnimal
 from .style import (
     BLUE,
     INK,

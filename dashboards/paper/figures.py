@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from liex_lab.evaluation.scores import Array, Followed, MeasuredIndividual
+from liex_lab.arrays import Array, NDArray
+from liex_lab.evaluation.scores import Followed, MeasuredIndividual
 from liex_lab.recordings.formats.images.nyu import POINTS
 from liex_lab.simulation.recording import RenderedRecording, TrueAnimal
 

@@ -13,14 +13,14 @@ from typing import Any
 import cv2
 import numpy as np
 from matplotlib import colormaps
-from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import action_colours
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import SessionError
 from liex_lab.scene.scene import Fixture
 from liex_lab.sessions import Session
 
-from ..figures.animals import Array, read_cutout
+from ..figures.animals import read_cutout
 from ..figures.places import hidden_places, in_image
 from ..video.film import Relief, scale_mm
 

@@ -16,14 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import LONGEST_GAP_S
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.skeleton import VIEWS, Skeleton
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 _FLIP_S = 0.15  # to either side: a body that briefly points the other way is an error
 _GROUPS = 3  # parts of the chain whose bends are summed

@@ -17,15 +17,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED, frame_words
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, one_line
 from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.text_files import clock_s, number, read_texts
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")

@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import UNLABELLED, runs_of
 from liex_lab.actions.labels import LabelledTrack, timeline_scores
@@ -24,13 +23,12 @@ from liex_lab.actions.timeline import (
     TimelineModel,
     gather,
 )
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError
 from liex_lab.geometry import SE3, so3
 from liex_lab.mlp import LIMIT, Network, descend
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 _HIDDEN = 64
 _EPOCHS = 10

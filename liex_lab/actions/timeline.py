@@ -19,7 +19,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.actions import _semi_markov_kernels as kernels
 from liex_lab.actions.channels import (
@@ -32,12 +31,11 @@ from liex_lab.actions.channels import (
 from liex_lab.actions.ethogram import UNLABELLED, Ethogram, frame_stops, runs_of
 from liex_lab.actions.labels import LabelledTrack
 from liex_lab.actions.vocabulary import FASTEST
+from liex_lab.arrays import Array, NDArray
 from liex_lab.mlp import Network
 from liex_lab.recordings.timestamps import median_step
 from liex_lab.runtime.memory import Allocator, blocks, check_shapes, in_windows, release_pages
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 _DECODED_PIECE = 8192  # ticks per block of probabilities ...
 _MARGIN = 512  # ... and its margin on either side

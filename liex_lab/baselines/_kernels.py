@@ -271,7 +271,7 @@ def unfold(values, levers, place, heading, tree, rotations, positions):
     turns = np.zeros(3)
     at = 7
     for j in range(1, tree.parents.size):
-        place_joint(j, tree, scale, rotations, positions)
+        place_joint(j, tree, tree.rest[j], scale, rotations, positions)
         n = 0
         for k in range(3):
             if tree.axes[j, k]:

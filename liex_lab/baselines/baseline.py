@@ -41,8 +41,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.baselines import _kernels as kernels
 from liex_lab.body.pose import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
@@ -60,8 +60,6 @@ from liex_lab.scene.height_maps import HeightMaps, Segmenter, in_camera_frame
 if TYPE_CHECKING:
     import torch
 
-
-Array = NDArray[np.float64]
 
 # exceptions that a broken .npz raises
 DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile)

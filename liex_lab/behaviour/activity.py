@@ -16,8 +16,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from liex_lab.arrays import Array, Mask, NDArray
 from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.days import Light
 from liex_lab.behaviour.kinematics import segments
@@ -27,8 +28,6 @@ from liex_lab.scene.scene import UNKNOWN, Arena
 from liex_lab.scene.zones import SEPARATOR
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import table_columns, to_pandas
-
-Array = NDArray[np.float64]
 
 BIN_S = 60.0
 FEWEST = 10  # bins, of a shorter recording
@@ -329,9 +328,6 @@ def around_onsets(
 
 
 # Position of the animal: zone visits, thigmotaxis (outer half of an open field), novel tank test.
-
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -10,29 +10,23 @@ bouts shorter than `min_bout_s` are dropped. If two actions claim a frame, the f
 wins. Default speeds: Live Mouse Tracker (de Chaumont et al. 2019).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.actions.timeline import Recognised, TimelineModel
 from liex_lab.actions.vocabulary import limits_of, printed_meanings
+from liex_lab.arrays import Array, Mask, NDArray
 from liex_lab.behaviour.body import STANDS, SWIMS, kind_of
 from liex_lab.behaviour.kinematics import Joints, kinematics, segments, smallest_turn
 from liex_lab.plan.sections import BehaviourThresholds
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tables.rows import Rows, constant_runs, frame_count, median_step, stop_times
 from liex_lab.tables.schema import BOUTS, table_columns, to_pandas
+from liex_lab.tracking.track import Track
 
-if TYPE_CHECKING:
-    from liex_lab.actions.timeline import Recognised, TimelineModel
-    from liex_lab.tracking.track import Track
-
-
-Array = NDArray[np.float64]
 _BOUTS = 256  # measured at once
 # between the curvatures of two thirds of the body, for a wave to be accepted
 
@@ -364,8 +358,6 @@ def measure_bouts(
 # The rule-based ethogram of a mouse.
 
 ACTIONS = ("rear", "groom", "run", "walk", "pause")  # if two claim a frame, the first wins
-
-Mask = NDArray[np.bool_]
 
 
 class MouseRules(BehaviourThresholds):

@@ -7,13 +7,11 @@ in the table, significant or not, tested or refused. `liex compare` and the dash
 show it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
 from itertools import combinations, product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -40,11 +38,8 @@ from liex_lab.behaviour.statistics import (
     spread_of_animals,
 )
 from liex_lab.plan.study import alike, one_animal, references_first
-from liex_lab.tables.schema import shown, table_columns, titled, to_pandas
+from liex_lab.tables.schema import SessionTables, shown, table_columns, titled, to_pandas
 from liex_lab.tracking.identity import CERTAIN
-
-if TYPE_CHECKING:
-    from liex_lab.tables.schema import SessionTables
 
 SUBJECT = ("subject_id", "group", "cage", "sex", "batch")
 ENGINES = ("auto", "permutation", "mixed")

@@ -26,13 +26,11 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import PlanError
 from liex_lab.tables.rows import stop_times
 from liex_lab.tables.schema import table_columns, to_pandas
-
-Array = NDArray[np.float64]
 
 FEWEST_DAYS = 3  # for measures of the regularity and the period of a rhythm
 _PERIODS_H = np.arange(18.0, 30.0, 0.05)

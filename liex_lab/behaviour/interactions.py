@@ -20,19 +20,17 @@ is merely hidden: its area lacks part of an animal, the volume below it does not
 is raised. The agent of such a mount was behind the other in most of the time before it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, pairwise, permutations
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.actions.vocabulary import INTERACTIONS as WORDS
+from liex_lab.arrays import Array, Mask, NDArray
 from liex_lab.behaviour.body import SWIMS, BodyAxis
 from liex_lab.behaviour.bouts import hysteresis, tidy
 from liex_lab.behaviour.kinematics import neighbours, segments
@@ -43,13 +41,7 @@ from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.runtime.memory import blocks
 from liex_lab.tables.rows import Rows, frame_count, stop_times
 from liex_lab.tables.schema import INTERACTIONS, to_pandas
-from liex_lab.tracking.track import CORRECTED, whole_gaps
-
-if TYPE_CHECKING:
-    from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from liex_lab.tracking.track import CORRECTED, Track, whole_gaps
 
 _ALONG = np.linspace(0.0, 1.0, 13)  # places along the body, from the front (0) to the rear (1)
 _TRUNK = _ALONG >= 0.25  # behind the head
@@ -80,13 +72,13 @@ class Individual:
     clear: Mask | None = None
 
     @staticmethod
-    def of_track(name: str, track: Track) -> Individual:
+    def of_track(name: str, track: Track) -> "Individual":
         """The animal of a track."""
         clear = np.asarray(track.flag != "unclear")
         trusted = track.observed & (np.isin(track.flag, ["", CORRECTED]) | ~clear)
         return Individual(name, track.skeleton, track.joints_mm, trusted, clear)
 
-    def bridged(self, time_s: Array, most_s: float) -> Individual:
+    def bridged(self, time_s: Array, most_s: float) -> "Individual":
         """The animal with poses interpolated where it has none for most_s or less."""
         known = self.trusted & np.isfinite(self.joints_mm).all(axis=(1, 2))
         flat = np.where(known[:, None], self.joints_mm.reshape(len(known), -1), np.nan)
@@ -264,7 +256,7 @@ class _Course(NamedTuple):
         return np.asarray(np.linalg.norm(self.velocity, axis=1))
 
     @staticmethod
-    def of(animal: Individual, time_s: Array, limits: InteractionThresholds) -> _Course:
+    def of(animal: Individual, time_s: Array, limits: InteractionThresholds) -> "_Course":
         skeleton = animal.skeleton
         body = BodyAxis.of(skeleton.names, skeleton.parents.tolist())
         flat = np.array([1.0, 1.0, float(body.kind == SWIMS)])
@@ -324,7 +316,7 @@ class _Toward(NamedTuple):
     closing: Array  # mm/s, of the agent towards the target
 
     @staticmethod
-    def of(a: _Course, b: _Course, limits: InteractionThresholds) -> _Toward:
+    def of(a: _Course, b: _Course, limits: InteractionThresholds) -> "_Toward":
         n = len(a.centre)
         gap, trunks, place, skin, above = np.empty((5, n))
         for part in blocks(n, _BLOCK):

@@ -24,15 +24,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.body import BRANCHES, STANDS, SWIMS, BodyAxis
 from liex_lab.runtime.memory import Allocator, blocks, in_windows, put
 from liex_lab.tables.rows import constant_runs, gap_follows, median_step, stop_times
 from liex_lab.tables.schema import table_columns, to_pandas
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 
 def posture(body: BodyAxis, xyz: Array, sd: Array) -> dict[str, Array]:

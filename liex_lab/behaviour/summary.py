@@ -6,17 +6,15 @@ and of all rears together) and times in zones. Shares are of the observed time, 
 frames only.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.actions.labels import HUMAN
+from liex_lab.arrays import Array
 from liex_lab.behaviour.activity import (
     Surroundings,
     activity,
@@ -36,23 +34,18 @@ from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.errors import PlanError
 from liex_lab.plan.sections import BehaviourThresholds, Period
 from liex_lab.runtime.memory import Allocator
-from liex_lab.tables.rows import stop_times
+from liex_lab.tables.rows import Rows, stop_times
 from liex_lab.tables.schema import (
     BEHAVIOUR,
     GAPS,
     Column,
+    SessionTables,
     Vocabulary,
     empty_table,
     rears_of,
     to_pandas,
 )
 from liex_lab.tracking.track import DOUBTFUL, ends_of
-
-if TYPE_CHECKING:
-    from liex_lab.tables.rows import Rows
-    from liex_lab.tables.schema import SessionTables
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -430,5 +423,5 @@ def _time_in_zones(frames: pd.DataFrame, zones: Sequence[str], hold: Array) -> d
     return found
 
 
-def _median(values: pd.Series[Any]) -> float:
+def _median(values: "pd.Series[Any]") -> float:
     return of_known(np.median, values.to_numpy(float))

@@ -21,8 +21,8 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, Mask
 from liex_lab.behaviour.activity import inside_zones
 from liex_lab.behaviour.body import BodyAxis
 from liex_lab.behaviour.kinematics import IMPOSSIBLE_MM_S
@@ -30,9 +30,6 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import PlanError
 from liex_lab.tables.rows import Rows
 from liex_lab.tables.schema import FRAMES, rears_of, table_columns
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 TRUTH = "true or false"  # the unit of an action and of a zone
 TOLERANCE_S = 0.5  # of a live event before the onset or after the end of that of the session

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body import _rasterizer_kernels as rasterizer_kernels
 from liex_lab.body import _skinning_kernels as skinning_kernels
 from liex_lab.body.pose import Pose
@@ -24,8 +24,6 @@ from liex_lab.optics.camera import Camera
 from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.memory import Rows, check_index, check_shapes
 from liex_lab.runtime.processes import in_parallel, threads
-
-Array = NDArray[np.float64]
 
 
 class Body(Rows):

@@ -18,13 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, how_to_install, refuse
 from liex_lab.geometry import so3
 from liex_lab.runtime.text_files import read_toml
-
-Array = NDArray[np.float64]
 
 AXES = ("roll", "pitch", "yaw")  # about x (forward), y (left), z (up) of the joint's own frame
 PRESETS = Path(__file__).parent / "presets"

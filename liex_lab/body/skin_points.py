@@ -11,18 +11,16 @@ with S the stated deviations in the frame R of the bone that carries the point, 
 of the joints, and w_j the weights of linear interpolation along the spine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body._skinning_kernels import BODY_SEGMENTS
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
-from liex_lab.body.skeleton import PRESETS, Array, Skeleton
+from liex_lab.body.skeleton import PRESETS, Skeleton
 from liex_lab.errors import LiexError, one_line, refuse
 from liex_lab.plan.sections import Positive, SettingsTable, first_twice
 

@@ -9,8 +9,8 @@ and of the capsules' radii; a forearm, a sleeve and an upper arm are more capsul
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body._skinning_kernels import TAIL_RINGS
 from liex_lab.body.pose import Pose, aim
 from liex_lab.body.shape import Body, BodyShape, Capsules, MeshBody, Surface
@@ -18,8 +18,6 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.geometry import so3
 from liex_lab.runtime.memory import Rows
-
-Array = NDArray[np.float64]
 
 FAMILIES = ("train", "augmented", "wide", "other")
 _WILD_SHARE = 0.6

@@ -1,7 +1,5 @@
 """`liex`: the table of commands. Jobs are imported on demand, so that `liex --help` is fast."""
 
-from __future__ import annotations
-
 import atexit
 import errno
 import gc

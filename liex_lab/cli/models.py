@@ -532,10 +532,6 @@ def evaluate_several(
         bool,
         typer.Option("--sealed", help="Use the held-out split; not for development."),
     ] = False,
-    only_true: Annotated[
-        bool,
-        typer.Option("--only-true", help="Only score the interactions of true joints."),
-    ] = False,
     *,
     progress: Progress,
 ) -> Result:
@@ -545,7 +541,6 @@ def evaluate_several(
         n_frames=n_frames,
         n_recordings=n_recordings,
         sealed=sealed,
-        measure=not only_true,
         progress=progress,
     )
 

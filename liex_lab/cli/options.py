@@ -1,7 +1,5 @@
 """Options shared by several commands of `liex`, and the output of numbers."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path

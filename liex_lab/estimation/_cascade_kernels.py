@@ -405,7 +405,9 @@ def _solve_joint(joint, j, tree, regressors, tuning, lanes, n, batch, candidates
         if joint > 0:
             i = lanes.frame[s]
             k = lanes.pose[s]
-            place_joint(joint, tree, scales[i, k], rotations[i, k], positions[i, k])
+            place_joint(
+                joint, tree, tree.rest[joint], scales[i, k], rotations[i, k], positions[i, k]
+            )
     first = 0 if j == 0 else tuning.base_rounds + (j - 1) * tuning.rounds
     for c in range(tuning.base_rounds if j == 0 else tuning.rounds):
         forest = first + c

@@ -200,12 +200,13 @@ def correct_joint(rotation, axes, values, lever):
 
 
 @kernel()
-def place_joint(j, tree, scale, rotations, positions):
-    """Place a joint relative to its parent, at its home angle.
+def place_joint(j, tree, own, scale, rotations, positions):
+    """Place a joint relative to its parent.
 
     Args:
         j: number of the joint.
         tree: `KinematicTree` of the skeleton.
+        own: (3, 3) rotation in the parent's frame; `tree.rest[j]` is the home angle.
         scale: of the bones.
         rotations: (J, 3, 3) joint frames; that of j is filled.
         positions: (J, 3) joints, mm; that of j is filled.
@@ -219,7 +220,7 @@ def place_joint(j, tree, scale, rotations, positions):
         for k in range(3):
             value = 0.0
             for m in range(3):
-                value += rotations[p, i, m] * tree.rest[j, m, k]
+                value += rotations[p, i, m] * own[m, k]
             rotations[j, i, k] = value
 
 
@@ -239,7 +240,7 @@ def place_rest(solved, tree, scale, rotations, positions):
         for s in solved:
             is_solved |= s == j
         if not is_solved:
-            place_joint(j, tree, scale, rotations, positions)
+            place_joint(j, tree, tree.rest[j], scale, rotations, positions)
 
 
 @kernel(nogil=True)
@@ -256,7 +257,7 @@ def place_all(j, tree, scale, rotations, positions, start, stop):
         stop: the item after the last.
     """
     for s in range(start, stop):
-        place_joint(j, tree, scale[s], rotations[s], positions[s])
+        place_joint(j, tree, tree.rest[j], scale[s], rotations[s], positions[s])
 
 
 @kernel(nogil=True)

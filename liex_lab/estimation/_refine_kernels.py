@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from liex_lab.estimation._feature_kernels import place_joint
 from liex_lab.estimation._residual_kernels import nearest_ball, place_balls
 from liex_lab.geometry._kernels import cholesky, exp_so3, substitute
 from liex_lab.runtime.kernels import inner_kernel, kernel
@@ -157,23 +158,13 @@ def forward(tree, root_rotation, root_position, angles, scale, rotations, positi
         for k in range(3):
             rotations[0, i, k] = root_rotation[i, k]
     for j in range(1, tree.parents.size):
-        p = tree.parents[j]
         exp_so3(angles[j, 0], angles[j, 1], angles[j, 2], turn)
         for i in range(3):
             for k in range(3):
                 local[i, k] = 0.0
                 for m in range(3):
                     local[i, k] += tree.rest[j, i, m] * turn[m, k]
-        for i in range(3):
-            total = positions[p, i]
-            for k in range(3):
-                total += scale * rotations[p, i, k] * tree.offsets[j, k]
-            positions[j, i] = total
-            for k in range(3):
-                value = 0.0
-                for m in range(3):
-                    value += rotations[p, i, m] * local[m, k]
-                rotations[j, i, k] = value
+        place_joint(j, tree, local, scale, rotations, positions)
 
 
 @kernel()

@@ -18,16 +18,14 @@ starts along the principal axis of the foreground in both directions, with small
 initialisation), which needs fewer initial poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import KinematicTree, aim
 from liex_lab.body.shape import Spheres
 from liex_lab.body.skeleton import REFERENCE_MM, Skeleton
@@ -44,8 +42,6 @@ from liex_lab.runtime.processes import in_parallel
 from liex_lab.scene._blob_kernels import N_MOMENTS
 from liex_lab.scene._height_map_kernels import N_CROP_CAMERA
 from liex_lab.scene.height_maps import moment_columns
-
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -85,7 +81,7 @@ class Candidates:
         position: Array,
         scale: Array,
         size: Array,
-    ) -> Candidates:
+    ) -> "Candidates":
         """Make candidates with only the base in place.
 
         Args:
@@ -323,7 +319,7 @@ class Cascade:
             )
 
     def labels(
-        self, candidates: Candidates, joint: int, truth: Truth
+        self, candidates: Candidates, joint: int, truth: "Truth"
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Corrections from the candidates to the truth, and the samples to learn from.
 

@@ -4,8 +4,6 @@ The same code runs both variants with these numbers. The paper's values (C round
 trees, depths, learned metric) are those of Lie-X sections 4 and 5.2 as far as stated there.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 

@@ -34,15 +34,15 @@ with w = 4 mm at the reference length.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.shape import Spheres
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import _feature_kernels as feature_kernels
 from liex_lab.estimation import _refine_kernels as kernels
 from liex_lab.estimation import _residual_kernels as residual_kernels
-from liex_lab.estimation.cascade import Array, Candidates, ImageSet, body_of, residuals
+from liex_lab.estimation.cascade import Candidates, ImageSet, body_of, residuals
 from liex_lab.geometry import SE3
 from liex_lab.mlp import Network, descend
 from liex_lab.runtime.processes import in_parallel

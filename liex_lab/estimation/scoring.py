@@ -19,11 +19,11 @@ correction", ours). It is evaluated for one pose per frame, at negligible cost.
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.estimation.cascade import Array, Candidates, ImageSet
+from liex_lab.estimation.cascade import Candidates, ImageSet
 from liex_lab.estimation.method import Method
 from liex_lab.estimation.model import ErrorCalibration, Model
 from liex_lab.forests._kernels import VIEW

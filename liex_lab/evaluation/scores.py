@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, Mask, NDArray
 from liex_lab.runtime.memory import Rows
 from liex_lab.tracking.track import spans
 
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from liex_lab.simulation.corruptions import Event
     from liex_lab.simulation.recording import TrueAnimal
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 POSE_PROTOCOL = (
     "Error of a frame: mean over joints of the 3D distance between measured and true joint, mm; "

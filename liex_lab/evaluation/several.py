@@ -15,13 +15,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from liex_lab.actions.vocabulary import INTERACTIONS
+from liex_lab.arrays import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Counts = dict[str, float]
 Deed = tuple[int, int, str, int, int]  # agent, target (-1: none), action, start and stop frame
 

@@ -19,15 +19,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binomtest, fisher_exact
 
+from liex_lab.arrays import Array, Mask, NDArray
 from liex_lab.errors import LiexError, refuse
 from liex_lab.sessions.clock import ClockMap
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 MOST_DRIFT = 0.005  # of a clock's rate; a quartz is within 0.0001
 _WINDOW = 40  # pulses whose differences vote
 _FEWEST = 8  # matched pulses

@@ -24,14 +24,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, how_to_install, one_line
 from liex_lab.recordings.formats.moseq_results import SHAPE
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
 from liex_lab.sessions.cutouts import open_depth, still_scene
-from liex_lab.sessions.session import Array
 
 _LOW_MM, _HIGH_MM = 10, 100
 _HALF_PX = 40

@@ -14,15 +14,14 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from pydantic import Field
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, did_you_mean, how_to_install, one_line, refuse
 from liex_lab.plan.sections import Positive, SettingsTable
 from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.text_files import read_text, read_toml, split_lines
 
-Array = NDArray[np.float64]
 Names = str | list[str]
 
 _UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import (
     LiexError,
     MissingPackageError,
@@ -20,7 +20,6 @@ from liex_lab.errors import (
 )
 from liex_lab.runtime import text_files
 
-Array = NDArray[np.float64]
 _TIMES = ("time_s", "timestamp_s", "timestamps_s", "time", "timestamp", "timestamps")
 _LEVEL = "level"
 

@@ -16,8 +16,6 @@ B and W were fitted to virtual mice, so that the tail lies within 30 degrees of 
 direction with the stated probability.
 """
 
-from __future__ import annotations
-
 from itertools import chain
 from typing import NamedTuple
 
@@ -25,9 +23,9 @@ import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from liex_lab.arrays import Array
 from liex_lab.sessions import Session
 from liex_lab.sessions.cutouts import Kept, meant_to_keep_depth, open_depth, still_scene
-from liex_lab.sessions.session import Array
 from liex_lab.tables.rows import median_step
 
 TAIL = "tail_30mm"

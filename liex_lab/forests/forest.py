@@ -17,15 +17,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import NDArray
 from liex_lab.errors import refuse
 from liex_lab.forests._kernels import ONE_PROBE, SCALAR, TWO_PROBES, VIEW, descend
 from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.memory import Rows, check_index, check_shapes
 from liex_lab.runtime.processes import in_parallel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ Small angles use the series of these factors. Vectors are (..., 3) radians, rota
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from liex_lab.arrays import Array, NDArray
 
 _SMALL_EXP = 1e-8  # th^2 below which exp uses its series
 _SMALL_A = 1e-6  # th^2 below which A and its inverse use their series

@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from liex_lab.arrays import Array
 from liex_lab.errors import LiexError
-
-Array = NDArray[np.float64]
 
 BROWN_CONRADY = "brown_conrady"
 KANNALA_BRANDT = "kannala_brandt"

@@ -6,10 +6,10 @@ from dataclasses import dataclass as plain_dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic.dataclasses import dataclass
 
-Array = NDArray[np.float64]
+from liex_lab.arrays import Array
+
 _WANDER = 2e-5  # change of a clock's rate that must be expected beyond the events
 
 

@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from liex_lab.actions.ethogram import Ethogram
 from liex_lab.actions.labels import sessions_named, words_of
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, SessionError, refuse
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
@@ -31,8 +31,6 @@ from liex_lab.sessions.corrections import (
 from liex_lab.sessions.cutouts import Kept, open_depth
 from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import ROUNDED_S, frame_count, rows_between, stop_times
-
-Array = NDArray[np.float64]
 
 _WORD_LENGTH = 60
 # shares of the animal's length: its least distance in front of the still scene, and its largest

@@ -16,8 +16,8 @@ from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
@@ -30,8 +30,6 @@ from liex_lab.tables import schema as tables
 from liex_lab.tables.rows import NOT_FROM_CAMERA, Rows, median_step, stop_times
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Crossing, Flip, Subject, Track
-
-Array = NDArray[np.float64]
 
 FILE = "observations.npz"
 _ROWS = 10_000  # written at once

@@ -39,8 +39,8 @@ from mcap.records import (
     SummaryOffset,
 )
 from mcap.stream_reader import StreamReader
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.interactions import Interactions
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
@@ -256,8 +256,6 @@ def _bytes_of(record: McapRecord) -> bytes:
     record.write(built)
     return bytes(built.end())
 
-
-Array = NDArray[np.float64]
 
 _SECOND = 10**9
 _BLOCK = 8192  # frames of a track in memory at a time

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import rerun as rr
-from numpy.typing import NDArray
 
 from liex_lab.actions import vocabulary
+from liex_lab.arrays import Array, NDArray
 from liex_lab.behaviour.body import logged_of
 from liex_lab.behaviour.interactions import Interactions
 from liex_lab.body.skeleton import Skeleton
@@ -50,8 +50,6 @@ from liex_lab.tables.rows import Rows, constant_runs, frame_count, stop_times
 from liex_lab.tables.schema import shown
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 SKELETON = "arena/skeleton"
 ROOT = "arena/root"

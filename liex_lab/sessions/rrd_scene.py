@@ -27,9 +27,9 @@ from typing import Any, Final
 import cv2
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from liex_lab.actions import vocabulary
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape, Surface
 from liex_lab.body.skeleton import Skeleton
@@ -42,8 +42,6 @@ from liex_lab.sessions.cutouts import N_WINDOWS, Boxes, window_around, windows
 from liex_lab.sessions.provenance import Provenance
 from liex_lab.tables.rows import Rows
 from liex_lab.tracking.track import Track
-
-Array = NDArray[np.float64]
 
 IMAGE = "arena/camera/image"
 DEPTH = f"{IMAGE}/depth"

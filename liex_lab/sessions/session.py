@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import MissingPackageError, SessionError, how_to_install
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
@@ -500,7 +500,6 @@ def found_video(session: Session, what: str = "") -> Path | None:
 # A session's poses as plain arrays.
 
 
-Array = NDArray[np.float64]
 _KEPT = 0.6  # the usual threshold of likelihoods: least value in trusted frames
 
 

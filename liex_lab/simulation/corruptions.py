@@ -10,13 +10,11 @@ finished depth images.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.optics.camera import Camera
 from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import OBJECT_FACES, SimulatedScene, draw_object, mesh_of
-
-Array = NDArray[np.float64]
 
 # kind: (share of the events, shortest and longest in s)
 EVENTS = {

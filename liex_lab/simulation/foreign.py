@@ -18,11 +18,11 @@ from itertools import product
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.spatial.transform import Rotation
 from scipy.special import logsumexp, softmax
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body._skinning_kernels import joined_faces
 from liex_lab.body.shape import render_mesh
 from liex_lab.errors import LiexError, refuse
@@ -33,7 +33,6 @@ from liex_lab.simulation.recording import TrueAnimal
 from liex_lab.simulation.scene import SPHERE_TUBE, SceneSpec, SimulatedScene, rounded
 from liex_lab.simulation.species import TANK
 
-Array = NDArray[np.float64]
 # ellipsoids: place along the spine (0 rear, 1 front), left, up; radii forward, left, up; all in
 # body lengths. Those with left > 0 exist on both sides
 _MOUSE = (

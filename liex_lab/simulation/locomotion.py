@@ -11,9 +11,9 @@ while it scoots, glides, turns, rises, dives and rests.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, BodyShape
 from liex_lab.body.skeleton import Skeleton
@@ -30,7 +30,6 @@ from liex_lab.simulation.pose_prior import (
 )
 from liex_lab.simulation.scene import SimulatedScene, floor_point
 
-Array = NDArray[np.float64]
 Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]
 Path = Callable[[np.random.Generator, SimulatedScene, float, Array], tuple[Array, Array]]
 

@@ -17,8 +17,8 @@ joint's position between its limits (`draw_angles`).
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body._skinning_kernels import chain_arc, spine_frame
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, BodyShape
@@ -26,8 +26,6 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.processes import in_parallel
-
-Array = NDArray[np.float64]
 
 # share of frames: walking, curled up, reared up, hunched (grooming, eating), reaching with the head
 KINDS = ("walk", "curl", "rear", "hunch", "reach")

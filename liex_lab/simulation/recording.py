@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface, render_mesh
 from liex_lab.body.skeleton import Skeleton
@@ -29,8 +29,6 @@ from liex_lab.simulation.corruptions import Event, Loss
 from liex_lab.simulation.rendering import Solid, Views
 from liex_lab.simulation.scene import OBJECT_FACES, SimulatedScene, draw_object
 from liex_lab.simulation.sensors import Sensor
-
-Array = NDArray[np.float64]
 
 FRAME_NS = 33_333_333
 OTHER_CAMERA = "other-camera"  # focal lengths and resolutions not used in training

@@ -1,21 +1,17 @@
 """Depth images of labelled meshes before a still scene, through a sensor, on all threads."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.processes import in_parallel
 from liex_lab.simulation import _render_kernels as kernels
 from liex_lab.simulation._sensor_kernels import NORMAL, OBJECT
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ class Solid(Rows):
         faces: NDArray[np.int32],
         shown: NDArray[np.bool_] | None = None,
         label: int = OBJECT,
-    ) -> Solid:
+    ) -> "Solid":
         """A mesh with its own shape in every frame, or one that only appears and disappears.
 
         Args:
@@ -81,7 +77,7 @@ class Views(Rows):
     floor: Array
 
     @staticmethod
-    def of(camera: Camera, T_arena_camera: SE3, parameters: Array, ground: Array) -> Views:
+    def of(camera: Camera, T_arena_camera: SE3, parameters: Array, ground: Array) -> "Views":
         """One camera n times."""
         n = len(parameters)
         intrinsics = np.tile(camera.intrinsics, (n, 1))

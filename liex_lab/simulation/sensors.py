@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.optics.camera import (
     AZURE_KINECT,
     DEPTH_MODES,
@@ -28,8 +28,6 @@ from liex_lab.optics.camera import (
     Camera,
 )
 from liex_lab.simulation import _sensor_kernels as k
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,13 @@ in any order. `MouseSpecies` is the mouse, `FishSpecies` the zebrafish, `Generic
 with a skeleton.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, BodyShape, Surface
 from liex_lab.body.skeleton import VIEWS, Skeleton
@@ -63,8 +61,6 @@ from liex_lab.simulation.scene import (
 )
 from liex_lab.simulation.sensors import RAYTRIX_R5_SENSOR, SENSORS, Sensor, draw_units, unseen
 from liex_lab.simulation.training_patches import PER_SESSION, TrainingPatches
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -480,7 +476,7 @@ class GenericSpecies(Species):
     """
 
     @staticmethod
-    def of(skeleton: Skeleton) -> GenericSpecies:
+    def of(skeleton: Skeleton) -> "GenericSpecies":
         """The species of a skeleton: visible by the Raytrix R5 below 35 mm of length, in a scene in
         which the whole animal is visible from anywhere, at a sufficient size.
         """

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
@@ -21,8 +21,6 @@ from liex_lab.simulation import _render_kernels as kernels
 from liex_lab.simulation._sensor_kernels import EROSION, NOISE
 from liex_lab.simulation.rendering import Solid, Views, inverse_depth
 from liex_lab.simulation.scene import PART_FACES, SceneSpec, rounded
-
-Array = NDArray[np.float64]
 
 PER_SESSION = 8
 BLOCK = 512  # images made from one generator

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from numpy.typing import NDArray
 from scipy.special import erf
 
 from liex_lab.actions.ethogram import Ethogram, runs_of
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import SessionError
 from liex_lab.geometry import so3
 from liex_lab.recordings.timestamps import Gap, frames_apart, rounded_step
@@ -34,8 +34,6 @@ from liex_lab.tables.schema import (
     to_pandas,
 )
 from liex_lab.tracking.track import Crossing, Flip, Track
-
-Array = NDArray[np.float64]
 
 # start_s, stop_s, start_frame, stop_frame, frames missing, reason, x mm, y mm
 _Found = tuple[float, float, int, int, int, str, float, float]

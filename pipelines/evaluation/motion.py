@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
-from liex_lab.body.skeleton import Array, Skeleton
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, refuse
 from liex_lab.exchange.points import PointNames, read_points
 from liex_lab.runtime.progress import Progress, silent

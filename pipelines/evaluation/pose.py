@@ -18,10 +18,10 @@ from typing import Any, Final, cast
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.baselines.baseline import Baseline, Guesses, PlainMean
-from liex_lab.body.skeleton import Array, Skeleton
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import EstimationError, LiexError, PlanError
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import METHODS

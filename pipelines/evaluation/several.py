@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from liex_lab.arrays import Array
 from liex_lab.behaviour.interactions import Individual, find_interactions
 from liex_lab.errors import LiexError
 from liex_lab.evaluation.scores import error_of
@@ -41,8 +41,6 @@ from liex_lab.tracking.track import spans
 from ..build import plan_of
 from .scenes import run_product
 
-Array = NDArray[np.float64]
-
 SEEDS: Final = tuple(range(2001, 2049))
 SEALED_SEEDS: Final = tuple(range(958_311_701, 958_311_749))
 _SENSORS = (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, *unseen((KINECT_V2_SENSOR,)))
@@ -56,7 +54,6 @@ def evaluate_several(
     n_frames: int = 1800,
     n_recordings: int = 6,
     sealed: bool = False,
-    measure: bool = True,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure rendered groups of mice, and score the tables, see `SEVERAL_PROTOCOL`.
@@ -66,7 +63,6 @@ def evaluate_several(
         n_frames: length of each recording.
         n_recordings: of different seeds, 1 to 48.
         sealed: use the sealed seeds, which are not for development.
-        measure: False only scores the interactions of true joints.
         progress: called recording by recording.
 
     Returns:
@@ -92,7 +88,7 @@ def evaluate_several(
         recording.files.known_digest = hashlib.sha256(
             f"{recording.name} {animals} {apart} {n_frames}".encode()
         ).hexdigest()
-        one, sentences = _counts(recording, acts, measure)
+        one, sentences = _counts(recording, acts)
         for name in ("all", "15 % apart" if apart else "equal", f"builds: {family}"):
             results.setdefault(name, []).append(one)
         messages += [sentence for sentence in sentences if sentence not in messages]
@@ -106,9 +102,7 @@ def evaluate_several(
     }
 
 
-def _counts(
-    recording: RenderedRecording, acts: Sequence[Act], measure: bool
-) -> tuple[Counts, list[str]]:
+def _counts(recording: RenderedRecording, acts: Sequence[Act]) -> tuple[Counts, list[str]]:
     """Counts of one recording, those of interactions under `true` and `measured`, and the messages
     of the run.
     """
@@ -124,8 +118,6 @@ def _counts(
     found = {f"true {name}": value for name, value in deed_counts(deeds, exact, n).items()}
     touching = np.asarray(np.nan_to_num(gaps, nan=np.inf) <= _CONTACT_MM)
     found["contact_s"] = float(touching.sum()) / 2.0 * float(np.median(np.diff(time_s)))
-    if not measure:
-        return found, []
     began = time.perf_counter()
     plan = plan_of("mouse").with_settings([f"animal.count={len(actors)}"])
     individuals, messages, _ = run_product(recording, plan)
@@ -205,20 +197,18 @@ def _figures(counts: Counts) -> dict[str, Any]:
     def ratio(of: str, per: str) -> float | None:
         return counts[of] / counts[per] if counts.get(per) else None
 
-    figures: dict[str, Any] = {}
     hours = counts["contact_s"] / 3600.0
-    if "n_frames" in counts:
-        figures = {
-            "swaps": int(counts["swaps"]),
-            "swaps_per_contact_hour": counts["swaps"] / hours if hours else None,
-            **track_figures(counts),
-            "joint_error_apart_mm": ratio("apart_mm", "n_apart"),
-            "joint_error_contact_mm": ratio("contact_mm", "n_contact"),
-            "abstained": ratio("abstained", "n_asked"),
-            **crossing_figures(counts),
-            "frames_per_s": ratio("n_frames", "seconds"),
-        }
-    figures["contact_s"] = counts["contact_s"]
+    figures: dict[str, Any] = {
+        "swaps": int(counts["swaps"]),
+        "swaps_per_contact_hour": counts["swaps"] / hours if hours else None,
+        **track_figures(counts),
+        "joint_error_apart_mm": ratio("apart_mm", "n_apart"),
+        "joint_error_contact_mm": ratio("contact_mm", "n_contact"),
+        "abstained": ratio("abstained", "n_asked"),
+        **crossing_figures(counts),
+        "frames_per_s": ratio("n_frames", "seconds"),
+        "contact_s": counts["contact_s"],
+    }
     for kind in ("true", "measured"):
         own = {
             name.removeprefix(f"{kind} "): value

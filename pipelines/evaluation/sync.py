@@ -8,8 +8,8 @@ further ones, and jitters. The error is that of the map, at 200 moments of the c
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array
 from liex_lab.exchange.clocks import SyncError, align
 from liex_lab.runtime.progress import Progress, silent
 
@@ -32,7 +32,6 @@ KINDS = (
     "jump",
 )
 _WRONG_S = 0.01  # off by more at a tenth of the moments is wrong; so is any of unrelated
-Array = NDArray[np.float64]
 
 
 def base_train(kind: str, duration_s: float, rng: np.random.Generator) -> Array:

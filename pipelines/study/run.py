@@ -17,17 +17,19 @@ import pandas as pd
 
 from liex_lab.errors import LiexError, StudyError
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
-from liex_lab.runtime import durable, progress, text_files
+from liex_lab.runtime import durable, text_files
+from liex_lab.runtime.progress import Board, progress_board
 from liex_lab.sessions import Session, corrections, verdict
 from liex_lab.sessions.folder import FAILED_FILE, read_failure
 from liex_lab.tables.schema import dictionary, table_columns, write_table
 
 from ..compare import find_sessions
 from ..compiling import compile_ahead
+from ..correct import correct_session
+from ..session import run_session
 from .cluster import SlurmTable, crew_of, is_encrypted
-from .crew import Crew, RunSession
+from .crew import Crew
 from .status import (
-    InspectSession,
     SessionStatus,
     inspect_animal,
     pending_inspections,
@@ -185,42 +187,42 @@ def _number(value: Any) -> float:
 
 
 def run_study(
-    study: Study,
-    run: RunSession,
+    study: str | Path,
     *,
-    workers: int,
-    scheduler: str | None,
-    slurm: str | Path | None,
-    retry: bool,
-    again: bool,
-    only: Sequence[str],
-    dry_run: bool,
-    board: Callable[[int], AbstractContextManager[progress.Board]],
-    # writes descriptions into a session, with their author: `liex_lab.api.correct_session`
-    describe: Callable[..., Path],
-    inspect: InspectSession = inspect_animal,
+    workers: int = 0,
+    scheduler: str | None = None,
+    slurm: str | Path | None = None,
+    retry: bool = False,
+    again: bool = False,
+    only: Sequence[str] = (),
+    dry_run: bool = False,
+    board: Callable[[int], AbstractContextManager[Board]] = progress_board,
 ) -> list[SessionStatus]:
-    """Measure the pending sessions of a study; returns every session's status.
+    """Measure the pending sessions of a study; returns the status of every session.
+
+    A session that fails leaves failed.json in its folder and does not stop the others. If the study
+    has shared = "subject", the sessions of each animal are analysed first, and measured with the
+    size and shape they agree on. The study's table is rewritten at the end.
 
     Args:
-        study: the study.
-        run: measures a recording, `liex_lab.api.run_session`.
-        workers: processes on this machine; 0 means one for every two cores.
-        scheduler: address of a running Dask scheduler; None starts workers.
-        slurm: TOML file with the settings of Slurm jobs; None does not use Slurm.
-        retry: measure failed sessions again.
-        again: measure all sessions again.
-        only: ids of sessions, the others are left out; () means all.
-        dry_run: only return the status.
-        board: opens the display of so many sessions' progress.
-        describe: writes descriptions into a session, `liex_lab.api.correct_session`.
-        inspect: inspects a session's animal.
+        study: the study file, or the folder that contains study.toml.
+        workers: local processes; 0 uses one for every two cores.
+        scheduler: address of a Dask scheduler whose workers are used instead.
+        slurm: TOML file that configures Slurm workers; not together with `scheduler`.
+        retry: repeat sessions that failed.
+        again: repeat done and failed sessions; excluded ones stay excluded.
+        only: ids of the sessions to measure; () measures all.
+        dry_run: measure nothing; return the current status.
+        board: creates the progress display for a number of jobs (a context manager).
+
+    Returns:
+        One `SessionStatus` per session, in the order of the study file.
 
     Raises:
-        StudyError: both scheduler and slurm are given, or no scheduler answers at that address.
-        SessionError: another process measures the study.
-        LiexError: an id in `only` is not in the study.
+        StudyError: the study file or its settings cannot be used, or another process is measuring
+            the study.
     """
+    planned = Study.load(study)
     if scheduler and slurm:
         raise StudyError(
             "the workers are found either with --scheduler or with --slurm; leave one of them out"
@@ -228,36 +230,38 @@ def run_study(
     if scheduler:
         is_encrypted(scheduler)  # raises an error for an invalid address
     table = SlurmTable.load(slurm) if slurm else None
-    ask = partial(standings, study, retry=retry, only=only, again=again)
+    ask = partial(standings, planned, retry=retry, only=only, again=again)
     before = ask()
     if dry_run:
         return before
-    pending = pending_inspections(study, only, retry, again)
+    pending = pending_inspections(planned, only, retry, again)
     written = [
         *(one.session.folder for one in before),
         *(session.folder for session in pending),
     ]
-    for place in (study.cohort_folder, *written):
-        durable.unlinked_below(study.results, place)
-    study.cohort_folder.mkdir(parents=True, exist_ok=True)
+    for place in (planned.cohort_folder, *written):
+        durable.unlinked_below(planned.results, place)
+    planned.cohort_folder.mkdir(parents=True, exist_ok=True)
     with durable.locked(
-        study.cohort_folder / ".lock",
-        f"the study {study.name} is being measured by another process",
+        planned.cohort_folder / ".lock",
+        f"the study {planned.name} is being measured by another process",
     ):
         with _crew(before, pending, workers=workers, scheduler=scheduler, slurm=table) as crew:
             if pending and crew:
-                _inspect(pending, inspect, crew, board)
+                _inspect(pending, crew, board)
                 before = ask()
             for one in before:
                 if one.described:
                     descriptions = [
                         corrections.Description(key, value) for key, value in one.described.items()
                     ]
-                    describe(one.session.folder, descriptions, author=f"study {study.name}")
+                    correct_session(
+                        one.session.folder, descriptions, author=f"study {planned.name}"
+                    )
             if (todo := to_measure(before)) and crew:
-                _measure(todo, run, crew, board)
-        after = standings(study)
-        write_study_table(study, after)
+                _measure(todo, crew, board)
+        after = standings(planned)
+        write_study_table(planned, after)
     return after
 
 
@@ -291,9 +295,8 @@ def _crew(
 
 def _inspect(
     sessions: Sequence[PlannedSession],
-    inspect: InspectSession,
     crew: Crew,
-    board: Callable[[int], AbstractContextManager[progress.Board]],
+    board: Callable[[int], AbstractContextManager[Board]],
 ) -> None:
     """Inspect sessions, and store the findings."""
     known = {session.id: session for session in sessions}
@@ -305,10 +308,10 @@ def _inspect(
             done = failure or f"shows an animal of {found['animal']['spine_mm']:.1f} mm"
             _ended(shown, found["session_id"], "could not be inspected", done)
 
-        crew.inspect(sessions, inspect, shown.report, finished)
+        crew.inspect(sessions, inspect_animal, shown.report, finished)
 
 
-def _ended(shown: progress.Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
+def _ended(shown: Board, id: str, failed: str, done: str | dict[str, Any]) -> None:
     """Show that the work on a session ended: a sentence, or the failure that ended it."""
     sentence = done if isinstance(done, str) else f"{failed}: {done['reason']}"
     shown.finish(id, sentence, failed=not isinstance(done, str))
@@ -316,9 +319,8 @@ def _ended(shown: progress.Board, id: str, failed: str, done: str | dict[str, An
 
 def _measure(
     todo: list[SessionStatus],
-    run: RunSession,
     crew: Crew,
-    board: Callable[[int], AbstractContextManager[progress.Board]],
+    board: Callable[[int], AbstractContextManager[Board]],
 ) -> None:
     with board(len(todo)) as shown:
 
@@ -330,4 +332,4 @@ def _measure(
             done = f"is done, in {result['seconds']:.0f} s{taken}{review}"
             _ended(shown, result["id"], "failed", result["failure"] or done)
 
-        crew.measure(todo, run, shown.report, finished)
+        crew.measure(todo, run_session, shown.report, finished)

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from liex_lab.actions import ethogram, learning, storage, vocabulary
 from liex_lab.actions.labels import LabelledTrack, read_labels, sessions_named, words_of
-from liex_lab.body.pose import Array, Pose
+from liex_lab.arrays import Array, NDArray
+from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.errors import LiexError
 from liex_lab.estimation.estimator import PoseEstimator

@@ -28,10 +28,10 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
-from liex_lab.body.skeleton import Array, Skeleton
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.evaluation.scores import along_body
 from liex_lab.geometry import SE3, so3

@@ -118,14 +118,14 @@ def test_joints_placed_and_turned_one_after_the_other_give_the_forward_kinematic
     expected = forward_kinematics(skeleton, root, angles, np.array(scale))
     rotations, positions = np.zeros((skeleton.n_joints, 3, 3)), np.zeros((skeleton.n_joints, 3))
     rotations[0], positions[0] = root.rotation, root.translation
-    home = (KinematicTree.of(skeleton), scale, rotations, positions)
+    tree, home = KinematicTree.of(skeleton), (scale, rotations, positions)
     for joint in skeleton.solved[1:]:
-        kernels.place_joint(joint, *home)
+        kernels.place_joint(joint, tree, tree.rest[joint], *home)
         kernels.correct_joint(
             rotations[joint], skeleton.axes[joint], angles[joint][skeleton.axes[joint]], 1.0
         )
     solved = (rotations.copy(), positions.copy())
-    kernels.place_rest(np.array(skeleton.solved), *home)
+    kernels.place_rest(np.array(skeleton.solved), tree, *home)
     np.testing.assert_allclose(rotations, expected[0], atol=1e-12)
     np.testing.assert_allclose(positions, expected[1], atol=1e-10)
     np.testing.assert_array_equal(rotations[skeleton.solved], solved[0][skeleton.solved])

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter, lfilter_zi
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Body, Surface
 from liex_lab.scene.height_maps import Patches
@@ -23,8 +23,6 @@ from liex_lab.simulation.scene import draw_views
 from liex_lab.simulation.sensors import Sensor, draw_units
 from liex_lab.simulation.species import Species
 from liex_lab.simulation.training_patches import floor_views
-
-Array = NDArray[np.float64]
 
 STEP_S = 0.005  # of the animal's clock, independent of the camera's rate
 UNLABELLED = ""

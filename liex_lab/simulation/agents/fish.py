@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.simulation.agents.agent import (
@@ -29,8 +29,6 @@ from liex_lab.simulation.agents.agent import (
 )
 from liex_lab.simulation.pose_prior import bend_profile, hung, root_rotation
 from liex_lab.simulation.species import FishSpecies
-
-Array = NDArray[np.float64]
 
 ACTIONS = ("scoot", "j_turn", "c_turn", "r_turn", "surface", "dive", "zigzag", "thrash", "freeze")
 _ROLL, _FRONT, _HIND, _WAVE, _BEAT = range(3, 8)

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape
 from liex_lab.body.skeleton import Skeleton
@@ -29,8 +29,6 @@ from liex_lab.simulation.agents.agent import (
 )
 from liex_lab.simulation.pose_prior import Posture, resting_heights, stand
 from liex_lab.simulation.species import MouseSpecies
-
-Array = NDArray[np.float64]
 
 ACTIONS = (
     "walk",

@@ -6,8 +6,6 @@ labelled frames of a person of the NYU Hand Pose data set (Tompson et al. 2014) 
 available.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -15,8 +13,8 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body._skinning_kernels import CAPSULE_RINGS, CAPSULE_SEGMENTS, joined_faces
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
@@ -43,8 +41,6 @@ from liex_lab.simulation.scene import BOX, SPHERE_TUBE, SimulatedScene, rounded
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor, draw_units, unseen
 from liex_lab.simulation.species import Species
 from liex_lab.simulation.training_patches import TrainingPatches
-
-Array = NDArray[np.float64]
 
 # Location of the labelled hands to which test postures are fitted.
 

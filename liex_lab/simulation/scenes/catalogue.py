@@ -6,8 +6,8 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import RecordingError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
@@ -168,8 +168,6 @@ RECIPES: Final[Mapping[str, SceneRecipe]] = MappingProxyType(
 
 # Recordings of mice from a recipe and a seed.
 
-
-Array = NDArray[np.float64]
 
 _COMMUTATOR_MM = np.array([80.0, 110.0, 300.0])  # from the centre of the arena
 _OBJECTS = {"object": 0.4, "object out": 0.6}  # time of the change, share of the recording

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array
 from liex_lab.geometry import SE3, so3
 from liex_lab.simulation.locomotion import smoothed
 from liex_lab.simulation.recording import Actor, RenderedRecording, Take
@@ -23,8 +23,6 @@ from liex_lab.simulation.scenes.places import Mesh
 from liex_lab.simulation.scenes.stage import draw_mouse, free_spot, timing_of
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
 from liex_lab.simulation.species import MouseSpecies
-
-Array = NDArray[np.float64]
 
 _HZ = 30.0
 _TURN = 6.0 / _HZ  # rad per frame, the fastest turn

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body._skinning_kernels import tube_faces
 from liex_lab.body.pose import Pose
 from liex_lab.body.shape import BodyShape, render_mesh
@@ -22,7 +22,6 @@ from liex_lab.optics.camera import Camera
 from liex_lab.simulation.locomotion import smoothed
 from liex_lab.simulation.scene import ROUND, SimulatedScene, rounding, turned, unevenness
 
-Array = NDArray[np.float64]
 CABLE_SEGMENTS = 6
 
 _BOX_CORNERS = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)

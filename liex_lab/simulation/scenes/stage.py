@@ -4,18 +4,14 @@ Body, posture and path of an animal are drawn from the seed alone, not from the 
 animal behaves the same in every scene of a seed, as far as the arena permits.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.shape import Surface
 from liex_lab.simulation.locomotion import Path, Script, free_path, smoothed, walk, waver
 from liex_lab.simulation.recording import Actor, Take
 from liex_lab.simulation.scene import SimulatedScene
 from liex_lab.simulation.species import MouseSpecies
-
-Array = NDArray[np.float64]
 
 _RATE_HZ = 30.0
 _TRIES = 60

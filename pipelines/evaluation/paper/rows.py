@@ -15,15 +15,15 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.baselines.baseline import (
     Guesses,
     PlainMean,
     chosen,
     second_is_likelier,
 )
-from liex_lab.body.skeleton import Array, Skeleton
+from liex_lab.body.skeleton import Skeleton
 from liex_lab.estimation import estimator, training
 from liex_lab.estimation.cascade import N_DIRECTIONS, Candidates, Cascade, TrainingSet
 from liex_lab.estimation.method import Method, method_of

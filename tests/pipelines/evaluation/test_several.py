@@ -52,15 +52,12 @@ def test_one_animal_of_two_is_half_found_and_has_no_interactions(monkeypatch):
     assert row["found"] == pytest.approx(0.5)
     assert row["idf1"] == pytest.approx(2 / 3)
     assert row["interactions_measured"] is None
+    assert row["contact_s"] >= 0
     assert result["said"] == ["two in view"]
     assert set(result["rows"]) == {"all", "equal", "15 % apart", "builds: train"}
 
 
 def test_seeds_are_apart_and_wrong_numbers_are_refused():
     assert max(several.SEEDS) < SEALED_FROM <= min(several.SEALED_SEEDS)
-    assert (
-        evaluate_several(n_frames=60, n_recordings=1, measure=False)["rows"]["all"]["contact_s"]
-        >= 0
-    )
     with pytest.raises(LiexError, match="1 to 48 recordings of 2 to 4 animals, got 1 of 5"):
         evaluate_several(5, n_recordings=1)

@@ -57,7 +57,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, int]:
     names = ["good0", "good1", "unlucky", *BROKEN, "last"]
     file = make_study(folder, [*names, "skipped"], skipped='exclude = "fell asleep"')
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("liex_lab.pipelines.session.run_session", pretended_run)
+        patch.setattr("liex_lab.pipelines.study.run.run_session", pretended_run)
         result = CliRunner().invoke(cli.app, ["cohort", str(file), "--workers", "2"])
     return file, result.output, result.exit_code
 
@@ -138,7 +138,7 @@ def test_a_recording_that_kills_its_worker_is_given_up_and_stops_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = make_study(tmp_path, ["deadly", "good"])
-    monkeypatch.setattr("liex_lab.pipelines.session.run_session", pretended_run)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.run_session", pretended_run)
     assert CliRunner().invoke(cli.app, ["cohort", str(file), "--workers", "2"]).exit_code == 3
     deadly, good = standings(Study.load(file))
     assert "worker process died" in (deadly.failure or {})["reason"]
@@ -216,8 +216,8 @@ def test_who_an_animal_is_changes_without_measuring(
     def never(*_: object, **__: object) -> Path:
         raise AssertionError("it measured")
 
-    monkeypatch.setattr("liex_lab.pipelines.correct.correct_session", describe)
-    monkeypatch.setattr("liex_lab.pipelines.session.run_session", never)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.correct_session", describe)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.run_session", never)
     runs = (tmp_path / "good.runs").stat().st_size
     api.run_study(file, workers=1)
     folder = Study.load(file).sessions[0].folder

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from liex_lab.pipelines.correct import correct_session
 from liex_lab.pipelines.study import status
 from liex_lab.pipelines.study.crew import measure_one
 from liex_lab.pipelines.study.run import list_sessions, run_study, study_rows
@@ -50,6 +49,8 @@ def here(n_tasks: int, **_: Any) -> Any:
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("liex_lab.pipelines.study.run.crew_of", here)
     monkeypatch.setattr("liex_lab.pipelines.study.run.compile_ahead", lambda *_: None)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.run_session", pretended_run)
+    monkeypatch.setattr("liex_lab.pipelines.study.run.inspect_animal", pretended_inspection)
 
 
 def make_study(folder: Path, sessions: Sessions, head: str = 'shared = "subject"\n') -> Path:
@@ -70,19 +71,10 @@ def make_study(folder: Path, sessions: Sessions, head: str = 'shared = "subject"
 
 
 def run(file: Path, **more: Any) -> dict[str, SessionStatus]:
-    settings: dict[str, Any] = {
-        "workers": 1,
-        "scheduler": None,
-        "slurm": None,
-        "retry": False,
-        "again": False,
-        "only": (),
-        "dry_run": False,
-        "board": lambda n: nullcontext(Board(n, lambda _: None)),
-        "describe": correct_session,
-        "inspect": pretended_inspection,
-    }
-    found = run_study(Study.load(file), pretended_run, **(settings | more))
+    def board(n: int) -> Any:
+        return nullcontext(Board(n, lambda _: None))
+
+    found = run_study(file, workers=1, board=board, **more)
     return {one.session.id.rpartition("-")[2]: one for one in found}
 
 
@@ -129,7 +121,7 @@ def test_nothing_is_shared_or_looked_at_unless_the_study_says_so(tmp_path: Path)
 
 
 def test_an_interrupted_study_goes_on_to_the_same_and_looks_at_nobody_twice(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lengths = {"m07/a": 80.0, "m07/b": 84.0, "m07/c": 81.5}
     whole = run(make_study(tmp_path / "whole", lengths))
@@ -142,8 +134,10 @@ def test_an_interrupted_study_goes_on_to_the_same_and_looks_at_nobody_twice(
         looked.append(session.id)
         return pretended_inspection(session, progress)
 
-    with pytest.raises(KeyboardInterrupt):
-        run(cut, inspect=interrupted)
+    with monkeypatch.context() as patch:
+        patch.setattr("liex_lab.pipelines.study.run.inspect_animal", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(cut)
     states = [one.state for one in standings(Study.load(cut))]
     assert states == ["new"] * 3
     found = run(cut)

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Fit, Pose, fit_poses
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, RecordingError
@@ -185,8 +186,6 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
 
 # Labels of the NYU hand pose data set (Tompson et al. 2014): the usual 14 of its 36 joints.
 
-
-Array = NDArray[np.float64]
 
 LABEL_CAMERA = Camera(588.03, 587.07, 320.0, 240.0, 640, 480, source="NYU Hand Pose")
 REFERENCE_FILE = "nyu_test_14joints.npz"
