@@ -31,8 +31,8 @@ _HALF = 0.5 - 1e-9
 _BINS = (0.0, 0.1, 0.3)  # of stated probabilities, from each on
 _SWAP_S = 0.5  # changes of several individuals within this time are one swap
 SEVERAL_PROTOCOL = (
-    "Rendered mice or fish that interact, each recording measured as `liex run` does and its tables read "
-    "back. idf1, hota: as TrackEval computes them, similarity 1 - d / 30 mm of the mean joint "
+    "Rendered mice or fish that interact, each recording measured as `liex run` does and its "
+    "tables read back. idf1, hota: as TrackEval computes them, similarity 1 - d / 30 mm of the mean joint "
     "distance d, so that 15 mm is a match for idf1; every animal counts in every frame. swaps: "
     "moments at which a measured individual goes over from one true animal to another (within "
     "15 mm, by assignment in each frame, in which it keeps its animal while that is within 15 mm, "

@@ -259,36 +259,32 @@ def swim(
         position, heading = path(rng, scene, length, speed * length)
         climb = np.gradient(position[:, 2]) / step_s / length  # body lengths/s
         pitch = np.radians(25.0) * np.tanh(climb / (speed + 0.5))
-        pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
-        pose.root.translation[:] += position
-        return pose, size
-    level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
-    low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
-    camera_mm = float(scene.T_arena_camera.translation[2])
-    top = max(camera_mm - NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
-    water = (float(low.max()) + 0.5, top)
-    position, heading = wander(rng, scene, length, speed, turning, pitch, water, step_s)
+    else:
+        level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
+        low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
+        camera_mm = float(scene.T_arena_camera.translation[2])
+        top = max(camera_mm - NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
+        water = (float(low.max()) + 0.5, top)
+        position, heading = wander(rng, scene, length, speed, turning, pitch, water, step_s)
     pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
     pose.root.translation[:] += position
     return pose, size
 
 
-def strokes(speed: Array, heading: Array) -> Strokes:
-    """The tail of a fish on a given path: it beats faster and wider at higher speed.
+def strokes(speed: Array, heading: Array, step_s: float) -> tuple[Array, Array, Array, Array]:
+    """The script of a fish on a given path, whose tail beats faster and wider at higher speed.
 
     Args:
         speed: (n,) body lengths/s.
         heading: (n,) rad, continuous.
+        step_s: between two frames, s.
+
+    Returns:
+        Speed, turning, and the tail's amplitude and phase, for `swim`.
     """
-
-    def script(
-        rng: np.random.Generator, n: int, step_s: float
-    ) -> tuple[Array, Array, Array, Array]:
-        share = np.minimum(speed / _BOUT_SPEED[1], 1.0)
-        beat = rng.uniform(-np.pi, np.pi) + 2 * np.pi * np.cumsum(2.0 + 7.0 * share) * step_s
-        return speed, np.gradient(heading) / step_s, 0.5 + 4.0 * np.sqrt(share), beat
-
-    return script
+    share = np.minimum(speed / _BOUT_SPEED[1], 1.0)
+    beat = 2 * np.pi * np.cumsum(2.0 + 7.0 * share) * step_s
+    return speed, np.gradient(heading) / step_s, 0.5 + 4.0 * np.sqrt(share), beat
 
 
 def _swim_script(

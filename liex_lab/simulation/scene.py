@@ -280,18 +280,6 @@ class SimulatedScene:
             outline.append(mesh[:, :2])
         return replace(scene, clutter=np.concatenate(outline), still=still)
 
-    def magnified(self, factor: float) -> "SimulatedScene":
-        """The scene in a unit of length that is smaller by a factor, without its depth image."""
-        T = self.T_arena_camera
-        return replace(
-            self,
-            T_arena_camera=SE3(T.rotation, T.translation * factor),
-            centre=self.centre * factor,
-            half=self.half * factor,
-            wall_mm=self.wall_mm * factor,
-            clutter=self.clutter * factor,
-        )
-
     def wall_clearance(self, xy: Array) -> Array:
         """Signed distance of floor points from the walls, mm; negative outside.
 

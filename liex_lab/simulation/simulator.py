@@ -231,17 +231,13 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
 
 def _open_pair(address: str, stated: dict[str, str]) -> Recording:
     """The recording of a group's address."""
-    settings: dict[str, _Setting] = {
-        "animal": (str, GROUPS.__contains__, f"one of {', '.join(GROUPS)}")
-    }
-    animal = {"animal": "mouse", **stated}["animal"]
-    if animal in GROUPS:
-        kind = next(kind for kind, own in _ANIMALS.items() if own == animal)
-        settings |= _settings(kind, Skeleton.load(animal).length, 20_000)
-    acts = GROUPS.get(animal, GROUPS["mouse"]).encounters
+    kind = "swim" if stated.get("animal") == "fish" else "walk"
+    settings = _settings(kind, Skeleton.load(_ANIMALS[kind]).length, 20_000)
+    settings["animal"] = (str, GROUPS.__contains__, f"one of {', '.join(GROUPS)}")
+    acts = GROUPS[_ANIMALS[kind]].encounters
     settings["animals"] = (int, lambda n: 2 <= n <= 4, "2, 3 or 4")
     settings["apart"] = (float, lambda share: 0.0 <= share <= 0.3, "a share from 0 to 0.3")
-    settings["act"] = (str, acts.__contains__, f"of a {animal} one of {', '.join(acts)}")
+    settings["act"] = (str, acts.__contains__, f"of a {_ANIMALS[kind]} one of {', '.join(acts)}")
     values = _unsealed(address, stated, settings)
     if act := values.pop("act", ""):
         values["encounters"] = (act,)

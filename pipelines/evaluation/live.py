@@ -1,7 +1,7 @@
 """Latency of live tracking and of its triggers: `liex evaluate live`.
 
-It renders up to 150 frames of a moving virtual animal, or 600 of several animals that interact, keeps
-them in memory and sends them through a local socket at the camera's pace, forwards and backwards:
+It renders up to 150 frames of a moving virtual animal, or 600 of several that interact, keeps them
+in memory and sends them through a local socket at the camera's pace, forwards and backwards:
 median, 95 % and largest latency, ms, of all frames since the first one that arrived after its
 predecessors were processed, which excludes learning the background.
 

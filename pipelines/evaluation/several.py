@@ -1,9 +1,10 @@
 """Evaluation of several animals: `liex evaluate several`.
 
-Groups of mice or fish that interact (`simulation.scenes.groups`) are rendered, measured as `liex run` does,
-and the tables scored: identity, errors apart and in contact, abstention and interactions.
-Conditions alternate: equal lengths or 15 % apart, three makes of cameras (for fish three lenses),
-and builds that models were trained on or not. Limits are those of mice over the animal's length. The sealed split uses other seeds, which appear in no development.
+Groups of mice or fish that interact (`simulation.scenes.groups`) are rendered, measured as `liex
+run` does, and the tables scored: identity, errors apart and in contact, abstention and
+interactions. Conditions alternate: equal lengths or 15 % apart, three makes of cameras (for fish
+three lenses), and builds that models were trained on or not. Limits are those of mice over the
+animal's length. The sealed split uses other seeds, which appear in no development.
 """
 
 import hashlib
@@ -85,7 +86,6 @@ def evaluate_several(
         )
     results: dict[str, list[Counts]] = {}
     messages: list[str] = []
-    sensors = KINDS[animal].sensors
     for k, seed in enumerate(seeds[:n_recordings]):
         progress(k, n_recordings, f"measuring group {k + 1}")
         apart, family = 0.15 * (k % 2), ("train", "other")[k // 2 % 2]
@@ -95,7 +95,7 @@ def evaluate_several(
             animal=animal,
             animals=animals,
             apart=apart,
-            sensor=sensors[k % 3],
+            sensor=KINDS[animal].sensors[k % 3],
             family=family,
         )
         recording.files.known_digest = hashlib.sha256(
@@ -209,8 +209,8 @@ def _of_gaps(gaps: Array, time_s: Array, limits: InteractionThresholds) -> list[
             if time_s[stop - 1] - time_s[start] >= limits.isolated_s
         ]
         for b in range(a):
-            touch = gaps[:, a, b] <= limits.contact_mm
-            found += [(a, b, "contact", *span) for span in spans(touch)]
+            near = spans(gaps[:, a, b] <= limits.contact_mm)
+            found += [(a, b, "contact", *span) for span in near]
     return found
 
 

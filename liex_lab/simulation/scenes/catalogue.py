@@ -281,9 +281,7 @@ class Making:
         spot = arena.centre + turned(arena.half * [-0.45, 0.4], arena.yaw)
         return box([*spot, half[2]], half, float(rng.uniform(-np.pi, np.pi)))
 
-    def _cast(
-        self, arenas: list[SimulatedScene]
-    ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
+    def _cast(self, arenas: list[SimulatedScene]) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals, the objects that move with them, and the still objects they need."""
         recipe = self.recipe
         timing = timing_of(recipe.presence, self.take.n_frames)

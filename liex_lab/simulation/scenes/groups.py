@@ -20,7 +20,7 @@ from liex_lab.geometry import SE3, so3
 from liex_lab.simulation.locomotion import GLIDE_S, smoothed, strokes, swim, walk
 from liex_lab.simulation.recording import Actor, RenderedRecording, Take
 from liex_lab.simulation.rendering import Solid
-from liex_lab.simulation.scene import SimulatedScene
+from liex_lab.simulation.scene import SimulatedScene, turned
 from liex_lab.simulation.scenes.catalogue import RECIPES, Making, SceneRecipe
 from liex_lab.simulation.scenes.places import Mesh
 from liex_lab.simulation.scenes.stage import draw_animal, free_spot, timing_of
@@ -66,36 +66,26 @@ class Kind:
         species: of the animals.
         recipe: of the arena.
         sensors: makes of cameras, the usual one first.
-        name: of a recording, before its seed.
         hz: frames/s.
         lengths_mm: of the longest animal, mm, from and to.
         unit: length in the arena of 1 mm of the script.
         wide: of two bodies side by side, between their mid-axes, for spines of 65.
-        aside: of two that pass each other, likewise, from and to.
-        trunk: the joints at its rear and front.
         encounters: the acts.
-        abreast: acts that the agent does while it goes with the target.
-        water: lowest and highest swimming, above the floor, in `unit`.
-        over: height between two that swim over each other, from and to, likewise.
-        glides: whether its speed decays between strokes, see `locomotion`.
+        water: lowest and highest position above the floor, in `unit`.
+        swims: whether it goes in bouts, keeps off the walls, and turns head first.
         going: its locomotion.
     """
 
     species: Callable[[], Species]
     recipe: SceneRecipe
     sensors: tuple[Sensor, ...]
-    name: str = "pair"
     hz: float = _HZ
     lengths_mm: tuple[float, float] = (60.0, 74.0)
     unit: float = 1.0
     wide: float = 36.0
-    aside: tuple[float, float] = (22.0, 40.0)
-    trunk: tuple[int, int] = (0, -2)
     encounters: tuple[str, ...] = ENCOUNTERS
-    abreast: tuple[str, ...] = ("follow", "chase")
     water: tuple[float, float] = (0.0, 0.0)
-    over: tuple[float, float] = (0.0, 0.0)
-    glides: bool = False
+    swims: bool = False
     going: Callable[..., tuple[Pose, Array]] = walk
 
 
@@ -116,18 +106,13 @@ KINDS: Final[Mapping[str, Kind]] = {
             scale=0.3,
         ),
         (RAYTRIX_R5_SENSOR, *unseen((RAYTRIX_R5_SENSOR,))),
-        name="fish-pair",
         hz=50.0,
         lengths_mm=(23.0, 28.0),
         unit=0.27,
         wide=14.0,
-        aside=(0.0, 20.0),
-        trunk=(10, 0),
         encounters=tuple(word for word in ENCOUNTERS if word not in ("mount", "huddle")),
-        abreast=("follow", "chase", "side_by_side_same"),
         water=(35.0, 200.0),
-        over=(40.0, 80.0),
-        glides=True,
+        swims=True,
         going=swim,
     ),
 }
@@ -198,21 +183,26 @@ class Group:
 
     def dive(self, agent: int, target: int, action: str) -> None:
         """Choose heights: two that meet are level, two that cross pass over each other."""
-        (low, top), (least, most) = self.kind.water, self.kind.over
+        low, top = self.kind.water
         self.level = self.deep.uniform(low, top, len(self.spine))
         if action != "apart":
-            span = (least, most) if action == "cross" else (0.0, 0.2 * least)
-            half = 0.5 * self.deep.choice([-1.0, 1.0]) * self.deep.uniform(*span)
-            middle = self.deep.uniform(low + abs(half), top - abs(half))
-            self.level[[agent, target]] = middle + half, middle - half
+            gap = (top - low) * self.deep.uniform(
+                *((0.25, 0.5) if action == "cross" else (0, 0.05))
+            )
+            self.level[[agent, target]] = self.deep.uniform(low, top - gap)
+            self.level[self.deep.choice([agent, target])] += gap
 
     def stroke(self, mover: int) -> float:
         """Speed over the usual one: a bout of swimming every 0.8 s, and a glide."""
-        since_s = (len(self.rows) + 7 * mover) % 24 / _HZ
-        return 2.5 * float(np.exp(-since_s / GLIDE_S)) if self.kind.glides else 1.0
+        now = (len(self.rows) + 7 * mover) % 24 / _HZ
+        return 2.5 * float(np.exp(-now / GLIDE_S)) if self.kind.swims else 1.0
 
     def step(self, mover: int, goal: Array, mm_s: float, shy: Sequence[int] = ()) -> float:
-        """Walk one frame towards a goal, around the animals of `shy`; returns the distance left."""
+        """Go one frame towards a goal, around the animals of `shy`; returns the distance left."""
+        if self.kind.swims:
+            room, yaw = self.arena.half - 0.65 * self.spine[mover], self.arena.yaw
+            local = np.clip(turned(goal - self.arena.centre, -yaw), -room, room)
+            goal = self.arena.centre + turned(local, yaw)
         gap = goal - self.at[mover]
         left = float(np.linalg.norm(gap))
         ahead = float(np.arctan2(gap[1], gap[0]))
@@ -226,7 +216,9 @@ class Group:
                 ahead += (np.sign(off) or 1.0) * (clear - abs(off))
         turn = (ahead - self.way[mover] + np.pi) % (2 * np.pi) - np.pi
         self.way[mover] += np.clip(turn, -_TURN, _TURN)
-        run = min(mm_s * self.stroke(mover), 8.0 * left + 20.0) * max(float(np.cos(turn)), 0.1) / _HZ
+        run = (
+            min(mm_s * self.stroke(mover), 8.0 * left + 20.0) * max(float(np.cos(turn)), 0.1) / _HZ
+        )
         self.at[mover] += min(run, left) * self.ahead(mover)
         return left
 
@@ -324,8 +316,8 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
         shy = ([target], [agent])
         if action == "cross":  # each to where the other was, past it on one side
             way = group.at[target] - group.at[agent]
-            aside = np.array([-way[1], way[0]]) / np.linalg.norm(way)
-            aside *= rng.uniform(*group.kind.aside)
+            aside = np.array([-way[1], way[0]]) / np.linalg.norm(way) * rng.uniform(22.0, 40.0)
+            aside *= group.kind.wide / 36.0
             goals, shy = [group.at[target] + aside, group.at[agent] - aside], ([], [])
         for _ in range(int(3.0 * _HZ)):
             for k, mover in enumerate((agent, target)):
@@ -333,7 +325,7 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
                     group.step(mover, goals[k], 170.0, shy[k])
             group.frame()
         return
-    if action in group.kind.abreast:
+    if action in ("follow", "chase") or (group.kind.swims and action == "side_by_side_same"):
         _pursue(group, agent, target, action, side * (wide + 3.0))
         return
     if action == "avoid":
@@ -370,11 +362,9 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
     group.act(agent, target, "nose_to_side" if action == "escape" else action, begun)
     if action == "huddle":  # they rest side by side
         group.act(agent, target, "side_by_side_same", begun)
-    if action == "mount":
-        group.wait(0.3)
-    leaver = target if action == "escape" or rng.random() < 0.3 else agent
-    if action == "mount":
-        leaver = target
+    group.wait(0.3 * (action == "mount"))
+    leaves = action == "escape" or rng.random() < 0.3 or action == "mount"
+    leaver = target if leaves else agent
     _leave(group, leaver, agent + target - leaver, action == "escape")
 
 
@@ -446,9 +436,7 @@ class _Making(Making):
 
     group: Group
 
-    def _cast(
-        self, arenas: list[SimulatedScene]
-    ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
+    def _cast(self, arenas: list[SimulatedScene]) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals of the group, and nothing else."""
         paths = np.stack(self.group.rows, axis=1)
         return [self._animal(k, path, arenas[0]) for k, path in enumerate(paths)], [], []
@@ -470,16 +458,20 @@ class _Making(Making):
             arena,
             replace(self.take, spine_mm=spine),
             timing_of("always", self.take.n_frames),
-            strokes(speed, heading) if kind.glides else lambda rng, n: (kinds, speed),
+            (lambda rng, n, step_s: strokes(speed, heading, step_s))
+            if kind.swims
+            else (lambda rng, n: (kinds, speed)),
             lambda rng, scene, spine_mm, mm_s: (place, heading),
             kind.going,
         )
-        return _risen(_aligned(animal, heading, kind.trunk), smoothed(path[:, 4], 4.0))
+        if kind.swims:
+            return animal
+        return _risen(_aligned(animal, heading), smoothed(path[:, 4], 4.0))
 
 
-def _aligned(animal: Actor, heading: Array, ends: tuple[int, int]) -> Actor:
+def _aligned(animal: Actor, heading: Array) -> Actor:
     """The animal turned about its centre, so that its trunk has the headings (n,) of its path."""
-    trunk = animal.joints[:, ends[1]] - animal.joints[:, ends[0]]
+    trunk = animal.joints[:, -2] - animal.joints[:, 0]
     turn = np.zeros((len(heading), 3))
     turn[:, 2] = heading - np.arctan2(trunk[:, 1], trunk[:, 0])
     rotation, centre = so3.exp(turn), animal.joints.mean(axis=1)
@@ -533,13 +525,20 @@ def film_group(
         sensor or kind.sensors[0],
         family=family,
         spine_mm=spine_mm,
-        name=f"{kind.name}-{seed}",
+        name=f"pair-{seed}" if animal == "mouse" else f"pair-{animal}-{seed}",
     )
     rng, deep = (np.random.default_rng([seed, part]) for part in (78, 79))
     base = (spine_mm or float(rng.uniform(*kind.lengths_mm))) / kind.unit
     spines = base * (1.0 + apart) ** -np.arange(animals, dtype=float)
     arena = Making(kind.recipe, seed, take)._arenas()[0]
-    group = Group(rng, deep, arena.magnified(1.0 / kind.unit), spines, kind)
+    T = arena.T_arena_camera
+    arena = replace(
+        arena,
+        T_arena_camera=SE3(T.rotation, T.translation / kind.unit),
+        centre=arena.centre / kind.unit,
+        half=arena.half / kind.unit,
+    )
+    group = Group(rng, deep, arena, spines, kind)
     while len(group.rows) * kind.hz / _HZ < n_frames:
         for action in rng.permutation(encounters or kind.encounters):
             agent, target = map(int, rng.permutation(animals)[:2])
