@@ -32,11 +32,11 @@ _BINS = (0.0, 0.1, 0.3)  # of stated probabilities, from each on
 _SWAP_S = 0.5  # changes of several individuals within this time are one swap
 SEVERAL_PROTOCOL = (
     "Rendered mice or fish that interact, each recording measured as `liex run` does and its "
-    "tables read back. idf1, hota: as TrackEval computes them, similarity 1 - d / 30 mm of the mean joint "
-    "distance d, so that 15 mm is a match for idf1; every animal counts in every frame. swaps: "
-    "moments at which a measured individual goes over from one true animal to another (within "
-    "15 mm, by assignment in each frame, in which it keeps its animal while that is within 15 mm, "
-    "as in CLEAR MOT, Bernardin and Stiefelhagen 2008; changes within 0.5 s are one). "
+    "tables read back. idf1, hota: as TrackEval computes them, similarity 1 - d / 30 mm of the "
+    "mean joint distance d, so that 15 mm is a match for idf1; every animal counts in every frame. "
+    "swaps: moments at which a measured individual goes over from one true animal to another "
+    "(within 15 mm, by assignment in each frame, in which it keeps its animal while that is within "
+    "15 mm, as in CLEAR MOT, Bernardin and Stiefelhagen 2008; changes within 0.5 s are one). "
     "swaps_per_contact_hour: swaps over the hours in which the skins of a pair are within 10 mm, "
     "summed over pairs. joint_error_apart_mm, joint_error_contact_mm: mean over joints and frames "
     "of the distance to the nearest true animal by assignment, capped at 65 mm, where that animal "
