@@ -37,10 +37,11 @@ Array = NDArray[np.float64]
 
 _HZ = 30.0
 _TURN = 6.0 / _HZ  # rad per frame, the fastest turn
+_WALKERS = ("side_by_side_opposite", "mount", "huddle")  # acts that swimmers do not do
 _HUNCH = 3  # of `pose_prior.KINDS`, the posture of animals that rest
 _AHEAD, _BEHIND = 0.5, 0.45  # from the body's centre to the nose and to the tail base, spines
 _ROOM_MM = 110.0  # between the centres of animals that pass each other
-_CLIMB = 70.0 / _HZ  # per frame, of animals that swim
+_CLIMB = 110.0 / _HZ  # per frame, of animals that swim
 ENCOUNTERS: Final = (
     "follow",
     "chase",
@@ -110,7 +111,7 @@ KINDS: Final[Mapping[str, Kind]] = {
         lengths_mm=(23.0, 28.0),
         unit=0.27,
         wide=14.0,
-        encounters=tuple(word for word in ENCOUNTERS if word not in ("mount", "huddle")),
+        encounters=tuple(word for word in ENCOUNTERS if word not in _WALKERS),
         water=(35.0, 200.0),
         swims=True,
         going=swim,
@@ -174,6 +175,10 @@ class Group:
     def ahead(self, mover: int) -> Array:
         """Unit vector of an animal's heading."""
         return np.array([np.cos(self.way[mover]), np.sin(self.way[mover])])
+
+    def left(self, mover: int) -> Array:
+        """Unit vector to an animal's left."""
+        return self.ahead(mover)[::-1] * [-1.0, 1.0]
 
     def frame(self) -> None:
         """Keep the present frame."""
@@ -272,8 +277,7 @@ def _meet(group: Group, agent: int, target: int, place: Array, turn: float) -> i
     toward = group.at[agent] - group.at[target]
     side = np.arctan2(toward[1], toward[0]) + group.rng.uniform(-0.5, 0.5)
     group.face(target, float(side - np.arctan2(place[1], place[0])))
-    ahead = group.ahead(target)
-    goal = group.at[target] + place[0] * ahead + place[1] * np.array([-ahead[1], ahead[0]])
+    goal = group.at[target] + place[0] * group.ahead(target) + place[1] * group.left(target)
     out = (goal - middle) / np.linalg.norm(goal - middle)
     start = goal + float(group.rng.uniform(90.0, 120.0)) * out
     group.walk(agent, start, 180.0, others, near_mm=15.0)
@@ -369,18 +373,20 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
 
 
 def _pursue(group: Group, agent: int, target: int, action: str, aside: float) -> None:
-    """Follow or chase: the agent goes along the target's path, about a body length behind; or to
-    one side of it, `aside` to the left.
+    """Follow or chase: the agent goes along the target's path, about a body length behind; or it
+    comes up to it from there on one side, `aside` to the left, and goes with it.
     """
     rng, behind = group.rng, 0.5 * float(group.spine[[agent, target]].sum())
     behind += float(rng.uniform(8.0, 30.0))
-    behind, aside = (behind, 0.0) if action in ("follow", "chase") else (4.0, aside)
+    least, aside = (behind, 0.0) if action in ("follow", "chase") else (4.0, aside)
     _meet(group, agent, target, np.array([-behind, aside]), 0.0)
-    trail = [group.at[agent].copy()]
-    trail += [group.at[agent] + s * (group.at[target] - group.at[agent]) for s in (0.33, 0.67, 1.0)]
+    trail = [group.at[agent] - aside * group.left(target)]
+    trail += [trail[0] + s * (group.at[target] - trail[0]) for s in (0.33, 0.67, 1.0)]
     pace = float(rng.uniform(*((380.0, 450.0) if action == "chase" else (120.0, 230.0))))
     begun, round_mm = len(group.rows), float(rng.choice([-1.0, 1.0]) * rng.uniform(70.0, 90.0))
     for i in range(int(rng.uniform(1.6, 2.6) * _HZ)):
+        begun += behind > least
+        behind = max(behind - 6.0, least)
         run = pace * group.stroke(target) / _HZ * min(1.0, (i + 1) / 8.0)
         group.way[target] += run / round_mm
         group.at[target] += run * group.ahead(target)
@@ -389,13 +395,16 @@ def _pursue(group: Group, agent: int, target: int, action: str, aside: float) ->
         back = np.concatenate([np.cumsum(steps[::-1])[::-1], [0.0]])  # mm behind the target
         here = np.array([np.interp(-behind, -back, axis) for axis in np.array(trail).T])
         then = np.array([np.interp(4.0 - behind, -back, axis) for axis in np.array(trail).T])
-        ahead, way = group.ahead(target), then - here
-        group.at[agent] = here + aside * np.array([-ahead[1], ahead[0]])
+        group.at[agent], way = here + aside * group.left(target), then - here
         if np.linalg.norm(way) > 0.1:
             turn = (np.arctan2(way[1], way[0]) - group.way[agent] + np.pi) % (2 * np.pi) - np.pi
             group.way[agent] += np.clip(turn, -_TURN, _TURN)
         group.frame()
     group.act(agent, target, action, begun)
+    if aside:  # two that turn side by side would touch
+        low, top = group.kind.water
+        group.level[agent] += np.copysign(0.3 * (top - low), 0.5 * (low + top) - group.level[agent])
+        group.wait(0.8)
     _leave(group, agent, target)
 
 
