@@ -304,6 +304,8 @@ def _measure_animals(
                 prepared.mark(writer, identity, k)
             crossings = [one for one in identity.crossings if k in one.animals]
             prepared.follow(writer, own_observations(whole[k], identity.slots[:, k]), crossings)
+        for writer in writers:
+            writer.others = [one.track.centroid_mm for one in writers if one is not writer]
         together = None
         if subjects[0].skeleton.is_chain:
             progress(0, None, "finding the interactions")

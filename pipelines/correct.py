@@ -307,7 +307,18 @@ def _apply(
     origin = evidence.provenance_of(raw, found.track.skeleton)
     index = raw.frames["frame_index"].to_numpy()
     rows = Rows(
-        found.track, index, origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
+        found.track,
+        index,
+        origin.name,
+        origin.individual,
+        origin.gaps,
+        origin.arena,
+        origin.zones,
+        others=[
+            one.joints_mm.mean(axis=1)
+            for one in (together.animals if together is not None else ())
+            if one.name != origin.individual
+        ],
     )
     results = evidence.Results(origin, rows, found.flips, found.crossings)
     behaviour, facts = _behaviour(raw, log, found, results)

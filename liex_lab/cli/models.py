@@ -520,8 +520,9 @@ def evaluate_scenes(
 @benchmark("several", lambda result: print_rows(flat_rows(result["rows"])))
 def evaluate_several(
     animals: Annotated[
-        int, typer.Option("--animals", min=2, max=4, help="Number of mice in each recording.")
+        int, typer.Option("--animals", min=2, max=4, help="Number of animals in each recording.")
     ] = 2,
+    animal: AnimalName = "mouse",
     n_frames: Annotated[
         int, typer.Option("--frames", min=300, help="Number of frames of each recording.")
     ] = 1800,
@@ -535,9 +536,10 @@ def evaluate_several(
     *,
     progress: Progress,
 ) -> Result:
-    """Measure rendered groups of mice: identity, errors in contact, and interactions."""
+    """Measure rendered groups of animals: identity, errors in contact, and interactions."""
     return api.evaluate_several(
         animals,
+        animal=animal,
         n_frames=n_frames,
         n_recordings=n_recordings,
         sealed=sealed,

@@ -29,12 +29,12 @@ _HALF = 0.5 - 1e-9
 _BINS = (0.0, 0.1, 0.3)  # of stated probabilities, from each on
 _SWAP_S = 0.5  # changes of several individuals within this time are one swap
 SEVERAL_PROTOCOL = (
-    "Rendered mice that interact, each recording measured as `liex run` does and its tables read "
-    "back. idf1, hota: as TrackEval computes them, similarity 1 - d / 30 mm of the mean joint "
-    "distance d, so that 15 mm is a match for idf1; every animal counts in every frame. swaps: "
-    "moments at which a measured individual goes over from one true animal to another (within "
-    "15 mm, by assignment in each frame, in which it keeps its animal while that is within 15 mm, "
-    "as in CLEAR MOT, Bernardin and Stiefelhagen 2008; changes within 0.5 s are one). "
+    "Rendered mice or fish that interact, each recording measured as `liex run` does and its "
+    "tables read back. idf1, hota: as TrackEval computes them, similarity 1 - d / 30 mm of the "
+    "mean joint distance d, so that 15 mm is a match for idf1; every animal counts in every frame. "
+    "swaps: moments at which a measured individual goes over from one true animal to another "
+    "(within 15 mm, by assignment in each frame, in which it keeps its animal while that is within "
+    "15 mm, as in CLEAR MOT, Bernardin and Stiefelhagen 2008; changes within 0.5 s are one). "
     "swaps_per_contact_hour: swaps over the hours in which the skins of a pair are within 10 mm, "
     "summed over pairs. joint_error_apart_mm, joint_error_contact_mm: mean over joints and frames "
     "of the distance to the nearest true animal by assignment, capped at 65 mm, where that animal "
@@ -49,7 +49,9 @@ SEVERAL_PROTOCOL = (
     "script of the animals; of contact and isolated the distances of the rendered skins. "
     "direction: of the frames in which an action is found for the right pair, or for the same pair "
     "the other way round, the share the right way. true: from true joints, measured: the "
-    "tables' own, null if these have fewer than two animals."
+    "tables' own, null if these have fewer than two animals. Lengths are those of mice; for fish "
+    "those of matches and the cap are 0.27 times as long, a match is within 4 mm, and those of "
+    "contact and interactions are of the plan, contact within 3 mm."
 )
 
 

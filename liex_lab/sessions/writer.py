@@ -111,6 +111,7 @@ class SessionWriter:
         self._seconds = 0.0
         self._track = Track.empty(origin.skeleton, np.zeros(0, np.int64))
         self._rows: Rows | None = None
+        self.others: Sequence[NDArray[np.float64]] = ()  # see `Rows`
         self._flips: Sequence[Flip] = ()
         self._crossings: Sequence[Crossing] | None = None
         self._candidates: Observations | None = None
@@ -310,7 +311,7 @@ class SessionWriter:
             origin = self.origin
             frames = np.array(self._index, np.int64)
             about = origin.name, origin.individual, origin.gaps, origin.arena, origin.zones
-            self._rows = Rows(self.track, frames, *about, self.allocate)
+            self._rows = Rows(self.track, frames, *about, self.allocate, self.others)
         return self._rows
 
     def note(self, **sections: Any) -> None:

@@ -31,6 +31,8 @@ from liex_lab.simulation.pose_prior import (
 from liex_lab.simulation.scene import SimulatedScene, floor_point
 
 Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]
+# speed, turning, and the tail's amplitude and phase, see `_swim_script`
+Strokes = Callable[[np.random.Generator, int, float], tuple[Array, Array, Array, Array]]
 Path = Callable[[np.random.Generator, SimulatedScene, float, Array], tuple[Array, Array]]
 
 _RATE_HZ = 30.0
@@ -46,7 +48,7 @@ _STRETCHES = {
 }
 _BLEND_S = 0.12  # standard deviation of the Gaussian blend between postures
 
-_GLIDE_S = 0.35  # time constant of a glide's speed
+GLIDE_S = 0.35  # time constant of a glide's speed
 _BOUT_SPEED = (1.0, 5.0)  # that a bout reaches, body lengths/s
 NEAREST_MM = 180.0  # of a fish to the camera: nearer, a large one does not fit in the image
 _BEND_PER_TURN = 0.55  # degrees per joint for each rad/s of turning
@@ -91,7 +93,7 @@ def walk(
     posture.turn[:, 1:-1] += sway[:, None] * [1.0, -0.5, -0.5]
     size = np.full(n_frames, spine_mm / skeleton.length)
     gap = smoothed(rng.uniform(0.0, 3.0, n_frames), _BLEND_S * _RATE_HZ)
-    return stand(skeleton, posture, heading, size, body, gap, position)
+    return stand(skeleton, posture, heading, size, body, gap, position[:, :2])
 
 
 def walk_script(rng: np.random.Generator, n: int) -> tuple[NDArray[np.int64], Array]:
@@ -228,10 +230,15 @@ def swim(
     shape: Body,
     length: float,
     n_frames: int,
-    step_s: float,
+    script: Strokes | None = None,
+    path: Path | None = None,
+    step_s: float = 0.02,
 ) -> tuple[Pose, Array]:
-    """The motion of one fish, and its girths, likewise, with `step_s` between two frames, s."""
-    speed, turning, amplitude, beat = _swim_script(rng, n_frames, step_s)
+    """The motion of one fish, and its girths, likewise, with `step_s` between two frames, s.
+
+    Positions of a `path` are (n, 3), with the heights; the fish climbs and dives along it.
+    """
+    speed, turning, amplitude, beat = (script or _swim_script)(rng, n_frames, step_s)
     # turns and waves run from head to tail
     hind = np.concatenate([np.zeros(2), turning[:-2]]) if n_frames > 2 else turning
     yaw = bend_profile(
@@ -247,15 +254,36 @@ def swim(
     size = np.full(n_frames, length / skeleton.length)
     pitch = np.radians(25.0) * np.tanh(smoothed(rng.normal(0.0, 6.0, n_frames), 25.0))
     roll = np.radians(smoothed(rng.normal(0.0, 12.0, n_frames), 8.0))
-    level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
-    low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
-    camera_mm = float(scene.T_arena_camera.translation[2])
-    top = max(camera_mm - NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
-    water = (float(low.max()) + 0.5, top)
-    position, heading = wander(rng, scene, length, speed, turning, pitch, water, step_s)
+    if path is not None:
+        position, heading = path(rng, scene, length, speed * length)
+        climb = np.gradient(position[:, 2]) / step_s / length  # body lengths/s
+        pitch = np.radians(25.0) * np.tanh(climb / (speed + 0.5))
+    else:
+        level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
+        low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)
+        camera_mm = float(scene.T_arena_camera.translation[2])
+        top = max(camera_mm - NEAREST_MM - float(high.max()), float(low.max()) + 2.0)
+        water = (float(low.max()) + 0.5, top)
+        position, heading = wander(rng, scene, length, speed, turning, pitch, water, step_s)
     pose = hung(skeleton, yaw, root_rotation(heading, pitch, roll), size)
     pose.root.translation[:] += position
     return pose, size
+
+
+def strokes(speed: Array, heading: Array, step_s: float) -> tuple[Array, Array, Array, Array]:
+    """The script of a fish on a given path, whose tail beats faster and wider at higher speed.
+
+    Args:
+        speed: (n,) body lengths/s.
+        heading: (n,) rad, continuous.
+        step_s: between two frames, s.
+
+    Returns:
+        Speed, turning, and the tail's amplitude and phase, for `swim`.
+    """
+    share = np.minimum(speed / _BOUT_SPEED[1], 1.0)
+    beat = 2 * np.pi * np.cumsum(2.0 + 7.0 * share) * step_s
+    return speed, np.gradient(heading) / step_s, 0.5 + 4.0 * np.sqrt(share), beat
 
 
 def _swim_script(
@@ -281,8 +309,8 @@ def _swim_script(
             brief = min(at + max(2, int(0.14 / step_s)), n)
             turning[at:brief] = rng.choice([-1.0, 1.0]) * rng.uniform(4.0, 16.0)
         glide = np.arange(max(0, min(resting, n - stop)))
-        speed[stop : stop + resting] = pace * np.exp(-(glide + 1) * step_s / _GLIDE_S)
-        pace *= float(np.exp(-resting * step_s / _GLIDE_S))
+        speed[stop : stop + resting] = pace * np.exp(-(glide + 1) * step_s / GLIDE_S)
+        pace *= float(np.exp(-resting * step_s / GLIDE_S))
         at = stop + resting
     return (
         smoothed(speed, 1.5),

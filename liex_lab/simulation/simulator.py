@@ -22,7 +22,8 @@ from liex_lab.simulation.foreign import KINDS, SEALED_BODY, ForeignRecording
 from liex_lab.simulation.hand.simulator import HandSpecies, find_reference
 from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.catalogue import SCENES, SEALED_FROM, film
-from liex_lab.simulation.scenes.groups import ENCOUNTERS, film_group
+from liex_lab.simulation.scenes.groups import KINDS as GROUPS
+from liex_lab.simulation.scenes.groups import film_group
 from liex_lab.simulation.sensors import BY_NAME, Sensor
 from liex_lab.simulation.species import FishSpecies, GenericSpecies, MouseSpecies, Species
 
@@ -144,7 +145,7 @@ def open_synthetic(address: str, camera: Lens | None = None) -> Recording:
     of a mouse, or with animal=fish or animal=hand of those; with a
     seed or more frames they are new sequences of the same kind. scene is one of
     `simulation.scenes`, such as synthetic:scene?name=raised&seed=3; build=train uses a training
-    body. pair are two to four mice that interact, such as
+    body. pair are two to four mice (or animal=fish) that interact, such as
     synthetic:pair?seed=3&animals=3&apart=0.15&act=follow, see `simulation.scenes.groups`: apart is
     the difference in length between one and the next. foreign is a body that does not come from
     the training's generator, such as
@@ -230,10 +231,13 @@ def _open_scene(address: str, stated: dict[str, str]) -> Recording:
 
 def _open_pair(address: str, stated: dict[str, str]) -> Recording:
     """The recording of a group's address."""
-    settings = _settings("walk", Skeleton.load("mouse").length, 20_000)
+    kind = "swim" if stated.get("animal") == "fish" else "walk"
+    settings = _settings(kind, Skeleton.load(_ANIMALS[kind]).length, 20_000)
+    settings["animal"] = (str, GROUPS.__contains__, f"one of {', '.join(GROUPS)}")
+    acts = GROUPS[_ANIMALS[kind]].encounters
     settings["animals"] = (int, lambda n: 2 <= n <= 4, "2, 3 or 4")
     settings["apart"] = (float, lambda share: 0.0 <= share <= 0.3, "a share from 0 to 0.3")
-    settings["act"] = (str, ENCOUNTERS.__contains__, f"one of {', '.join(ENCOUNTERS)}")
+    settings["act"] = (str, acts.__contains__, f"of a {_ANIMALS[kind]} one of {', '.join(acts)}")
     values = _unsealed(address, stated, settings)
     if act := values.pop("act", ""):
         values["encounters"] = (act,)

@@ -459,7 +459,7 @@ class FishSpecies(Species):
         self, rng: np.random.Generator, scene: SimulatedScene, shape: Any, length: float, n: int
     ) -> tuple[Pose, Array]:
         """A fish that swims in bouts."""
-        return swim(rng, scene, self.skeleton, shape, length, n, self.frame_ns * 1e-9)
+        return swim(rng, scene, self.skeleton, shape, length, n, step_s=self.frame_ns * 1e-9)
 
 
 # tilts from which the resting orientation on the floor is chosen

@@ -63,6 +63,7 @@ class Rows:
         arena: outline of the floor, within which the animal can be.
         zones: zones of the plan, arena frame.
         allocate: allocator of the columns of the table `frames`.
+        others: (n, 3) centres of each other animal of the arena, mm; NaN without a pose.
     """
 
     track: Track
@@ -73,6 +74,7 @@ class Rows:
     arena: Arena = UNKNOWN
     zones: Sequence[Zone] = ()
     allocate: Allocator = np.empty
+    others: Sequence[Array] = ()
 
     @property
     def time_s(self) -> Array:
@@ -232,8 +234,15 @@ class Rows:
             if reason == HIDDEN and len(observed_rows):
                 # the last observed position before, or the first one after it
                 last = max(0, int(np.searchsorted(observed_rows, start)) - 1)
-                x, y = self.track.centroid_mm[observed_rows[last], :2]
-                position = (float(x), float(y))
+                row = int(observed_rows[last])
+                x, y = self.track.centroid_mm[row, :2]
+                away = [
+                    np.linalg.norm(one[[row, start], :2] - [x, y], axis=1) for one in self.others
+                ]
+                if not (
+                    np.array(away) < self.track.spine_mm[row]
+                ).any():  # it did not hide, another animal was over it
+                    position = (float(x), float(y))
             found.append((*span, stop - start, reason, *position))
         found.sort()
         names = (*_SPAN_NAMES, "n_frames_missing", "reason", "x_mm", "y_mm")

@@ -1,7 +1,7 @@
 """Latency of live tracking and of its triggers: `liex evaluate live`.
 
-It renders up to 150 frames of a moving virtual animal, or 600 of several mice that interact, keeps
-them in memory and sends them through a local socket at the camera's pace, forwards and backwards:
+It renders up to 150 frames of a moving virtual animal, or 600 of several that interact, keeps them
+in memory and sends them through a local socket at the camera's pace, forwards and backwards:
 median, 95 % and largest latency, ms, of all frames since the first one that arrived after its
 predecessors were processed, which excludes learning the background.
 
@@ -29,7 +29,7 @@ from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError
 from liex_lab.recordings import streaming
 from liex_lab.runtime.progress import Progress, silent
-from liex_lab.simulation.scenes.groups import film_group
+from liex_lab.simulation.scenes.groups import KINDS, film_group
 from liex_lab.simulation.simulator import world_of
 
 from ..build import plan_of
@@ -67,7 +67,7 @@ def evaluate_live(
         learn_frames: frames that background, floor and size are learned from.
         rate_hz: frames per second that are sent; None means the camera's own rate.
         n_cameras: number of simultaneous cameras, each in a separate process.
-        n_animals: mice in one arena that interact.
+        n_animals: mice or fish in one arena that interact.
         rules: triggers of one camera, see `liex_lab.behaviour.triggers`.
         progress: called with the progress of rendering and tracking, if there is one camera.
 
@@ -77,10 +77,10 @@ def evaluate_live(
         `message_p95_ms`, from the arrival of a frame to that of its message in another process,
         `n_messages`, and in `triggers` the agreement with the finished session.
     """
-    if n_animals > 1 and (animal != "mouse" or rules):
+    if n_animals > 1 and (animal not in KINDS or rules):
         raise LiexError(
-            "several animals are mice without triggers in this evaluation; state --animal mouse, "
-            "and measure triggers of one animal"
+            "several animals are mice or fish without triggers in this evaluation; state --animal "
+            "mouse or fish, and measure triggers of one animal"
         )
     if rules:
         film = partial(_film, animal, n_frames, learn_frames, rate_hz, _SEED, progress=progress)
@@ -131,7 +131,7 @@ def _film(
         filmed = (
             world_of(Skeleton.load(animal)).motion(seed, min(150, n_frames))
             if n_animals == 1
-            else film_group(seed, min(600, n_frames), animals=n_animals)[0]
+            else film_group(seed, min(600, n_frames), animal=animal, animals=n_animals)[0]
         )
         step_ns = round(1e9 / rate_hz) if rate_hz else int(np.median(np.diff(filmed.times_ns)))
         arriving = looped(filmed, n_frames, f"live-{animal}", step_ns)

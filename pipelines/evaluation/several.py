@@ -1,9 +1,10 @@
 """Evaluation of several animals: `liex evaluate several`.
 
-Groups of mice that interact (`simulation.scenes.groups`) are rendered, measured as `liex run` does,
-and the tables scored: identity, errors apart and in contact, abstention and interactions.
-Conditions alternate: equal lengths or 15 % apart, three makes of cameras, and builds that models
-were trained on or not. The sealed split uses other seeds, which appear in no development.
+Groups of mice or fish that interact (`simulation.scenes.groups`) are rendered, measured as `liex
+run` does, and the tables scored: identity, errors apart and in contact, abstention and
+interactions. Conditions alternate: equal lengths or 15 % apart, three makes of cameras (for fish
+three lenses), and builds that models were trained on or not. Limits are those of mice over the
+animal's length. The sealed split uses other seeds, which appear in no development.
 """
 
 import hashlib
@@ -32,10 +33,10 @@ from liex_lab.evaluation.several import (
     track_counts,
     track_figures,
 )
+from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation.recording import RenderedRecording
-from liex_lab.simulation.scenes.groups import Act, film_group
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, PRIMESENSE_SENSOR, unseen
+from liex_lab.simulation.scenes.groups import KINDS, Act, film_group
 from liex_lab.tracking.track import spans
 
 from ..build import plan_of
@@ -43,23 +44,23 @@ from .scenes import run_product
 
 SEEDS: Final = tuple(range(2001, 2049))
 SEALED_SEEDS: Final = tuple(range(958_311_701, 958_311_749))
-_SENSORS = (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, *unseen((KINECT_V2_SENSOR,)))
-_CONTACT_MM, _ALONE_MM, _ALONE_S = 10.0, 100.0, 1.0  # of `contact` and `isolated`, as printed
-_CAP_MM = 65.0  # of a joint error, about a body length
+_CAP_MM = 65.0  # of a joint error of mice, about a body length
 
 
 def evaluate_several(
     animals: int = 2,
     *,
+    animal: str = "mouse",
     n_frames: int = 1800,
     n_recordings: int = 6,
     sealed: bool = False,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure rendered groups of mice, and score the tables, see `SEVERAL_PROTOCOL`.
+    """Measure rendered groups of animals, and score the tables, see `SEVERAL_PROTOCOL`.
 
     Args:
         animals: in each recording, 2 to 4.
+        animal: their kind, mouse or fish.
         n_frames: length of each recording.
         n_recordings: of different seeds, 1 to 48.
         sealed: use the sealed seeds, which are not for development.
@@ -69,8 +70,10 @@ def evaluate_several(
         `rows` of results over all recordings and by condition, the seeds and the protocol.
 
     Raises:
-        LiexError: there are not so many recordings, or animals.
+        LiexError: there are not so many recordings, or animals, or no groups of them.
     """
+    if animal not in KINDS:
+        raise LiexError(f"there are groups of {' and '.join(KINDS)} alone, got {animal}")
     seeds = SEALED_SEEDS if sealed else SEEDS
     if not (1 <= n_recordings <= len(seeds) and 2 <= animals <= 4):
         raise LiexError(
@@ -83,16 +86,23 @@ def evaluate_several(
         progress(k, n_recordings, f"measuring group {k + 1}")
         apart, family = 0.15 * (k % 2), ("train", "other")[k // 2 % 2]
         recording, acts = film_group(
-            seed, n_frames, animals=animals, apart=apart, sensor=_SENSORS[k % 3], family=family
+            seed,
+            n_frames,
+            animal=animal,
+            animals=animals,
+            apart=apart,
+            sensor=KINDS[animal].sensors[k % 3],
+            family=family,
         )
         recording.files.known_digest = hashlib.sha256(
             f"{recording.name} {animals} {apart} {n_frames}".encode()
         ).hexdigest()
-        one, sentences = _counts(recording, acts)
+        one, sentences = _counts(recording, animal, acts)
         for name in ("all", "15 % apart" if apart else "equal", f"builds: {family}"):
             results.setdefault(name, []).append(one)
         messages += [sentence for sentence in sentences if sentence not in messages]
     return {
+        "animal": animal,
         "animals": animals,
         "rows": {name: _figures(summed(counts)) for name, counts in results.items()},
         "said": messages,
@@ -102,24 +112,29 @@ def evaluate_several(
     }
 
 
-def _counts(recording: RenderedRecording, acts: Sequence[Act]) -> tuple[Counts, list[str]]:
+def _counts(
+    recording: RenderedRecording, animal: str, acts: Sequence[Act]
+) -> tuple[Counts, list[str]]:
     """Counts of one recording, those of interactions under `true` and `measured`, and the messages
     of the run.
     """
     actors, n = recording.stage.actors, len(recording)
     time_s = (recording.times_ns - recording.times_ns[0]) * 1e-9
     gaps = skin_gaps(recording)
-    deeds: list[Deed] = [*acts, *_of_gaps(gaps, time_s)]
+    plan = plan_of(animal).with_settings([f"animal.count={len(actors)}"])
+    limits, unit = plan.interactions, KINDS[animal].unit
+    deeds: list[Deed] = [*acts, *_of_gaps(gaps, time_s, limits)]
     true = [
         Individual(str(k), actor.surface.skeleton, actor.joints, actor.present)
         for k, actor in enumerate(actors)
     ]
-    exact = _deeds(find_interactions(time_s, true).events, {str(k): k for k in range(len(true))})
+    exact = _deeds(
+        find_interactions(time_s, true, limits).events, {str(k): k for k in range(len(true))}
+    )
     found = {f"true {name}": value for name, value in deed_counts(deeds, exact, n).items()}
-    touching = np.asarray(np.nan_to_num(gaps, nan=np.inf) <= _CONTACT_MM)
+    touching = np.asarray(np.nan_to_num(gaps, nan=np.inf) <= limits.contact_mm)
     found["contact_s"] = float(touching.sum()) / 2.0 * float(np.median(np.diff(time_s)))
     began = time.perf_counter()
-    plan = plan_of("mouse").with_settings([f"animal.count={len(actors)}"])
     individuals, messages, _ = run_product(recording, plan)
     found["seconds"] = time.perf_counter() - began
     camera = recording.T_arena_camera.inverse()
@@ -135,13 +150,14 @@ def _counts(recording: RenderedRecording, acts: Sequence[Act]) -> tuple[Counts, 
     resting = np.zeros(n, np.bool_)
     for act in acts:
         resting[act.start : act.stop] |= act.action == "huddle"
-    found |= track_counts(distance, time_s)
+    found |= track_counts(distance / unit, time_s)
     crossings = np.concatenate([np.zeros((0, 3)), *(one.crossings for one in individuals)])
-    found |= crossing_counts(distance, np.unique(crossings, axis=0))
-    found |= pose_counts(distance, np.asarray(touching.any(axis=2)), trusted, resting, _CAP_MM)
+    found |= crossing_counts(distance / unit, np.unique(crossings, axis=0))
+    most_mm = _CAP_MM * unit
+    found |= pose_counts(distance, np.asarray(touching.any(axis=2)), trusted, resting, most_mm)
     if individuals and (events := individuals[0].interactions) is not None:
         # of each individual the true animal that it is nearest to in most frames
-        cost = np.nan_to_num(np.minimum(distance, _CAP_MM), nan=_CAP_MM).mean(axis=0)
+        cost = np.nan_to_num(np.minimum(distance, most_mm), nan=most_mm).mean(axis=0)
         numbers = {f"animal{k}": int(one) for k, one in enumerate(cost.argmin(axis=0), 1)}
         own = deed_counts(deeds, _deeds(events, numbers), n)
         found |= {f"measured {name}": value for name, value in own.items()}
@@ -176,18 +192,19 @@ def skin_gaps(recording: RenderedRecording) -> Array:
     return gaps
 
 
-def _of_gaps(gaps: Array, time_s: Array) -> list[Deed]:
+def _of_gaps(gaps: Array, time_s: Array, limits: InteractionThresholds) -> list[Deed]:
     """True contact and isolation, by the distances of the skins."""
     nearest = np.nanmin(gaps, axis=2)
     found: list[Deed] = []
     for a in range(gaps.shape[1]):
         found += [
             (a, -1, "isolated", start, stop)
-            for start, stop in spans(nearest[:, a] > _ALONE_MM)
-            if time_s[stop - 1] - time_s[start] >= _ALONE_S
+            for start, stop in spans(nearest[:, a] > limits.isolated_mm)
+            if time_s[stop - 1] - time_s[start] >= limits.isolated_s
         ]
         for b in range(a):
-            found += [(a, b, "contact", *span) for span in spans(gaps[:, a, b] <= _CONTACT_MM)]
+            near = spans(gaps[:, a, b] <= limits.contact_mm)
+            found += [(a, b, "contact", *span) for span in near]
     return found
 
 

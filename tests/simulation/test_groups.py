@@ -54,6 +54,27 @@ def test_bodies_do_what_the_script_says(action):
         assert gap[start:stop].min() > 70.0
 
 
+@pytest.mark.parametrize("action", ["cross", "side_by_side_same", "follow"])
+def test_fish_swim_over_beside_and_behind_each_other_in_the_water(action):
+    recording, acts = film_group(7, 400, animal="fish", encounters=(action,))
+    a, b = (one.joints for one in recording.stage.actors)
+    assert min(a[..., 2].min(), b[..., 2].min()) > 3.0
+    assert recording.stage.scene.wall_clearance(np.stack([a, b])[..., :2]).min() > -3.0
+    off = a.mean(axis=1) - b.mean(axis=1)
+    if action == "cross":
+        nearest = int(np.linalg.norm(off[:, :2], axis=1).argmin())
+        assert np.linalg.norm(off[nearest, :2]) < 8.0
+        assert abs(off[nearest, 2]) > 8.0
+        return
+    start, stop = next((one.start, one.stop) for one in acts if one.action == action)
+    rows = slice((2 * start + stop) // 3, (start + 2 * stop) // 3)
+    speed = np.linalg.norm(np.diff(a[rows].mean(axis=1), axis=0), axis=1) * 50.0
+    assert np.median(speed) > 15.0
+    assert np.abs(off[rows, 2]).max() < 5.0
+    apart = np.linalg.norm(off[rows], axis=1)
+    assert apart.max() < 10.0 if action.startswith("side") else apart.min() > 15.0
+
+
 def test_an_address_opens_a_group_and_a_wrong_one_is_told():
     address = "synthetic:pair?seed=4&frames=40&animals=3&apart=0.1&act=cross&sensor=primesense"
     with open_recording(address) as recording:
@@ -61,5 +82,10 @@ def test_an_address_opens_a_group_and_a_wrong_one_is_told():
         assert (recording.name, len(recording)) == ("pair-4", 40)
         assert len(recording.animals) == 3
     assert "one of " + ENCOUNTERS[0] in refusal(Path("synthetic:pair?act=fight"))
+    with open_recording("synthetic:pair?animal=fish&frames=10&seed=4") as recording:
+        assert isinstance(recording, RenderedRecording)
+        assert (recording.name, recording.skeleton.name) == ("pair-fish-4", "fish")
+    assert "act is of a fish one of follow" in refusal(Path("synthetic:pair?animal=fish&act=mount"))
+    assert "animal is one of mouse, fish" in refusal(Path("synthetic:pair?animal=hand"))
     assert "animals is 2, 3 or 4" in refusal(Path("synthetic:pair?animals=1"))
     assert "kept for" in refusal(Path("synthetic:pair?seed=958204401"))

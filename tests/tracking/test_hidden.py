@@ -75,6 +75,17 @@ def test_the_gap_says_where_the_animal_was_last_seen_and_since_when(seen: Observ
     np.testing.assert_allclose(place, track.centroid_mm[first - 1, :2])
 
 
+@pytest.mark.parametrize(("away_mm", "hides"), [(20.0, False), (200.0, True)])
+def test_a_place_under_another_animal_is_no_hiding_place(
+    seen: Observations, away_mm: float, hides: bool
+) -> None:
+    track = track_whole(SUBJECT, seen).track
+    last = np.flatnonzero(track.observed[:60])[-1]
+    other = np.tile(track.centroid_mm[last] + [away_mm, 0.0, 0.0], (150, 1))
+    gaps = Rows(track, np.arange(150), "session", "mouse", others=[other]).gaps()
+    assert np.isfinite(gaps["x_mm"][list(gaps["reason"]).index("hidden")]) == hides
+
+
 @pytest.mark.parametrize("lag", [pytest.param(0, marks=pytest.mark.nightly), 6])
 def test_the_live_track_says_hidden_as_the_whole_recording_does(
     seen: Observations, lag: int

@@ -1,7 +1,7 @@
 """The scenes by name: mice from a recipe, a fish in a small tank, a hand, and a mirrored hand."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -28,13 +28,13 @@ from liex_lab.simulation.scenes import places
 from liex_lab.simulation.scenes.places import Bedding, Ground, Mesh, box, render_still
 from liex_lab.simulation.scenes.stage import (
     calm_script,
-    draw_mouse,
+    draw_animal,
     keeping_apart,
     timing_of,
     visiting,
 )
 from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
-from liex_lab.simulation.species import FishSpecies, MouseSpecies
+from liex_lab.simulation.species import FishSpecies, MouseSpecies, Species
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,7 @@ class SceneRecipe:
         bedding: whether there is bedding on the floor.
         glossy: whether the floor reflects and is partly unread.
         drift_mm: drift of the sensor's depth while it warms up, mm.
+        scale: of the floor's unevenness.
     """
 
     title: str
@@ -75,6 +76,7 @@ class SceneRecipe:
     bedding: bool = False
     glossy: bool = False
     drift_mm: float = 0.0
+    scale: float = 1.0
 
 
 _PLAIN = SceneRecipe("one mouse in a clean open field whose floor is the largest plane")
@@ -181,11 +183,13 @@ class Making:
         recipe: the scene's recipe.
         seed: seed of all random numbers.
         take: settings of the recording.
+        species: of the animals.
     """
 
     recipe: SceneRecipe
     seed: int
     take: Take
+    species: Species = field(default_factory=MouseSpecies, kw_only=True)
 
     def _rng(self, part: str) -> np.random.Generator:
         parts = ("camera", "place", "floor", "bedding", "worn", "sensor", "noise", "object")
@@ -194,11 +198,10 @@ class Making:
     def recording(self) -> RenderedRecording:
         """The recording with the truth of all animals in it."""
         recipe, n = self.recipe, self.take.n_frames
-        species = MouseSpecies()
         arenas = self._arenas()
-        animals, moving, parts = self._cast(species, arenas)
+        animals, moving, parts = self._cast(arenas)
         floor = self._rng("floor")
-        grounds = [Ground.draw(floor, arena) for arena in arenas]
+        grounds = [Ground.draw(floor, arena, recipe.scale) for arena in arenas]
         bedding = None
         if recipe.bedding:
             there = np.where(animals[0].present[:, None], _middle(animals[0]), np.nan)
@@ -206,18 +209,18 @@ class Making:
             lift = SE3.identity(n)
             lift.translation[:, 2] = bedding.below(np.nan_to_num(there))
             animals[0] = replace(animals[0], pose=animals[0].pose.moved(lift))
-        moving += self._worn(species, arenas[0], animals, parts)
+        moving += self._worn(arenas[0], animals, parts)
         stills, epoch = self._stills(arenas, grounds, bedding, parts)
         fur = animals[0].body.fur if animals else np.array([0.5])
         warming = 1.0 - np.exp(-np.arange(n) / max(1.0, 0.35 * n))
         stage = Stage(
             arenas[0],
-            species.skeleton,
+            self.species.skeleton,
             tuple(animals),
             tuple(moving),
             self.take.parameters(self._rng("sensor"), fur),
             self._rng("noise").integers(1, 2**63, n).astype(np.uint64),
-            np.arange(n) * species.frame_ns,
+            np.arange(n) * self.species.frame_ns,
             stills,
             epoch,
             offset_mm=recipe.drift_mm * warming if recipe.drift_mm else None,
@@ -276,9 +279,7 @@ class Making:
         spot = arena.centre + turned(arena.half * [-0.45, 0.4], arena.yaw)
         return box([*spot, half[2]], half, float(rng.uniform(-np.pi, np.pi)))
 
-    def _cast(
-        self, species: MouseSpecies, arenas: list[SimulatedScene]
-    ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
+    def _cast(self, arenas: list[SimulatedScene]) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals, the objects that move with them, and the still objects they need."""
         recipe = self.recipe
         timing = timing_of(recipe.presence, self.take.n_frames)
@@ -296,10 +297,10 @@ class Making:
             if which and recipe.n_arenas == 1:
                 path = keeping_apart(_middle(animals[0]), animals[0].spine_mm)
             animals.append(
-                draw_mouse(
+                draw_animal(
                     self.seed,
                     which,
-                    species,
+                    self.species,
                     arenas[which % len(arenas)],
                     self.take,
                     timing,
@@ -334,7 +335,6 @@ class Making:
 
     def _worn(
         self,
-        species: MouseSpecies,
         arena: SimulatedScene,
         animals: list[Actor],
         parts: list[Mesh],
@@ -344,7 +344,7 @@ class Making:
             return []
         rng = self._rng("worn")
         animal = animals[0]
-        mount = places.on_head(species.skeleton, animal.pose, animal.body[0], animal.girth)
+        mount = places.on_head(self.species.skeleton, animal.pose, animal.body[0], animal.girth)
         sides = places.HEAD_STAGE_MM if self.recipe.worn == "head stage" else places.PLUG_MM
         moving = [Solid.of(*places.stage_on(mount, sides), animal.present)]
         if self.recipe.worn == "tether":

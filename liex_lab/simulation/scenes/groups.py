@@ -1,35 +1,45 @@
-"""Groups of mice that interact, with the truth of their interactions: `synthetic:pair`.
+"""Groups of mice or fish that interact, with the truth of their interactions: `synthetic:pair`.
 
-A group plays encounters in turn: one animal walks up to another, does one of `ENCOUNTERS`, and one
+A group plays encounters in turn: one animal goes up to another, does one of `ENCOUNTERS`, and one
 of the two leaves. Each animal steers towards goals in the floor, around the others; its body and
-postures are those of `stage.draw_mouse`. Truth are the intentions of the script (`Act`), not
-distances: thresholds of the rules that are to be scored play no part.
+postures are those of `stage.draw_animal`. The script is that of mice at 30 steps/s; what is
+different for other animals, `Kind` states: their lengths over those of mice, their encounters, and
+the heights at which they swim. Truth are the intentions of the script (`Act`), not distances:
+thresholds of the rules that are to be scored play no part.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from liex_lab.arrays import Array
+from liex_lab.body.pose import Pose
 from liex_lab.geometry import SE3, so3
-from liex_lab.simulation.locomotion import smoothed
+from liex_lab.simulation.locomotion import GLIDE_S, smoothed, strokes, swim, walk
 from liex_lab.simulation.recording import Actor, RenderedRecording, Take
 from liex_lab.simulation.rendering import Solid
-from liex_lab.simulation.scene import SimulatedScene
-from liex_lab.simulation.scenes.catalogue import RECIPES, Making
+from liex_lab.simulation.scene import SimulatedScene, turned
+from liex_lab.simulation.scenes.catalogue import RECIPES, Making, SceneRecipe
 from liex_lab.simulation.scenes.places import Mesh
-from liex_lab.simulation.scenes.stage import draw_mouse, free_spot, timing_of
-from liex_lab.simulation.sensors import KINECT_V2_SENSOR, Sensor
-from liex_lab.simulation.species import MouseSpecies
+from liex_lab.simulation.scenes.stage import draw_animal, free_spot, timing_of
+from liex_lab.simulation.sensors import (
+    KINECT_V2_SENSOR,
+    PRIMESENSE_SENSOR,
+    RAYTRIX_R5_SENSOR,
+    Sensor,
+    unseen,
+)
+from liex_lab.simulation.species import FishSpecies, MouseSpecies, Species
 
 _HZ = 30.0
 _TURN = 6.0 / _HZ  # rad per frame, the fastest turn
+_WALKERS = ("side_by_side_opposite", "mount", "huddle")  # acts that swimmers do not do
 _HUNCH = 3  # of `pose_prior.KINDS`, the posture of animals that rest
 _AHEAD, _BEHIND = 0.5, 0.45  # from the body's centre to the nose and to the tail base, spines
 _ROOM_MM = 110.0  # between the centres of animals that pass each other
-_WIDE_MM = 36.0  # of two bodies side by side, between their mid-axes, for spines of 65 mm
+_CLIMB = 110.0 / _HZ  # per frame, of animals that swim
 ENCOUNTERS: Final = (
     "follow",
     "chase",
@@ -47,6 +57,66 @@ ENCOUNTERS: Final = (
 )
 
 
+@dataclass(frozen=True)
+class Kind:
+    """What groups of one kind of animal have that those of others have not.
+
+    Attributes:
+        species: of the animals.
+        recipe: of the arena.
+        sensors: makes of cameras, the usual one first.
+        hz: frames/s.
+        lengths_mm: of the longest animal, mm, from and to.
+        unit: length in the arena of 1 mm of the script.
+        wide: of two bodies side by side, between their mid-axes, for spines of 65.
+        encounters: the acts.
+        water: lowest and highest position above the floor, in `unit`.
+        swims: whether it goes in bouts, keeps off the walls, and turns head first.
+        going: its locomotion.
+    """
+
+    species: Callable[[], Species]
+    recipe: SceneRecipe
+    sensors: tuple[Sensor, ...]
+    hz: float = _HZ
+    lengths_mm: tuple[float, float] = (60.0, 74.0)
+    unit: float = 1.0
+    wide: float = 36.0
+    encounters: tuple[str, ...] = ENCOUNTERS
+    water: tuple[float, float] = (0.0, 0.0)
+    swims: bool = False
+    going: Callable[..., tuple[Pose, Array]] = walk
+
+
+KINDS: Final[Mapping[str, Kind]] = {
+    "mouse": Kind(
+        MouseSpecies,
+        RECIPES["plain"],
+        (KINECT_V2_SENSOR, PRIMESENSE_SENSOR, *unseen((KINECT_V2_SENSOR,))),
+    ),
+    "fish": Kind(
+        FishSpecies,
+        replace(
+            RECIPES["plain"],
+            title="fish in a small tank",
+            camera_mm=330.0,
+            half_mm=(62.0, 58.0),
+            wall_mm=60.0,
+            scale=0.3,
+        ),
+        (RAYTRIX_R5_SENSOR, *unseen((RAYTRIX_R5_SENSOR,))),
+        hz=50.0,
+        lengths_mm=(23.0, 28.0),
+        unit=0.27,
+        wide=14.0,
+        encounters=tuple(word for word in ENCOUNTERS if word not in _WALKERS),
+        water=(35.0, 200.0),
+        swims=True,
+        going=swim,
+    ),
+}
+
+
 class Act(NamedTuple):
     """What one animal did to another, by numbers, in the frames [start, stop)."""
 
@@ -62,14 +132,25 @@ class Group:
 
     Args:
         rng: random number generator.
-        arena: the arena.
-        spines: (A,) length of each animal, mm.
+        deep: random number generator of the heights.
+        arena: the arena, in the lengths of the script.
+        spines: (A,) length of each animal, likewise.
+        kind: of the animals.
     """
 
-    def __init__(self, rng: np.random.Generator, arena: SimulatedScene, spines: Array) -> None:
-        self.rng, self.arena, self.spine = rng, arena, spines
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        deep: np.random.Generator,
+        arena: SimulatedScene,
+        spines: Array,
+        kind: Kind,
+    ) -> None:
+        self.rng, self.deep, self.arena, self.spine, self.kind = rng, deep, arena, spines, kind
         self.acts: list[Act] = []
-        self.rows: list[Array] = []  # of each frame (A, 5): x, y, heading, resting, mounting
+        # of each frame (A, 6): x, y, heading, resting, mounting, height
+        self.rows: list[Array] = []
+        self.height = self.level = deep.uniform(*kind.water, len(spines))
         self.at = np.zeros((len(spines), 2))
         for i in range(len(spines)):
             self.at[i] = self._spot(i)
@@ -93,13 +174,38 @@ class Group:
         """Unit vector of an animal's heading."""
         return np.array([np.cos(self.way[mover]), np.sin(self.way[mover])])
 
+    def left(self, mover: int) -> Array:
+        """Unit vector to an animal's left."""
+        return self.ahead(mover)[::-1] * [-1.0, 1.0]
+
     def frame(self) -> None:
         """Keep the present frame."""
-        state = (self.at, self.way, self.resting, self.mounting)
+        self.height = self.height + np.clip(self.level - self.height, -_CLIMB, _CLIMB)
+        state = (self.at, self.way, self.resting, self.mounting, self.height)
         self.rows.append(np.column_stack(state))
 
+    def dive(self, agent: int, target: int, action: str) -> None:
+        """Choose heights: two that meet are level, two that cross pass over each other."""
+        low, top = self.kind.water
+        self.level = self.deep.uniform(low, top, len(self.spine))
+        if action != "apart":
+            gap = (top - low) * self.deep.uniform(
+                *((0.25, 0.5) if action == "cross" else (0, 0.05))
+            )
+            self.level[[agent, target]] = self.deep.uniform(low, top - gap)
+            self.level[self.deep.choice([agent, target])] += gap
+
+    def stroke(self, mover: int) -> float:
+        """Speed over the usual one: a bout of swimming every 0.8 s, and a glide."""
+        now = (len(self.rows) + 7 * mover) % 24 / _HZ
+        return 2.5 * float(np.exp(-now / GLIDE_S)) if self.kind.swims else 1.0
+
     def step(self, mover: int, goal: Array, mm_s: float, shy: Sequence[int] = ()) -> float:
-        """Walk one frame towards a goal, around the animals of `shy`; returns the distance left."""
+        """Go one frame towards a goal, around the animals of `shy`; returns the distance left."""
+        if self.kind.swims:
+            room, yaw = self.arena.half - 0.65 * self.spine[mover], self.arena.yaw
+            local = np.clip(turned(goal - self.arena.centre, -yaw), -room, room)
+            goal = self.arena.centre + turned(local, yaw)
         gap = goal - self.at[mover]
         left = float(np.linalg.norm(gap))
         ahead = float(np.arctan2(gap[1], gap[0]))
@@ -113,7 +219,9 @@ class Group:
                 ahead += (np.sign(off) or 1.0) * (clear - abs(off))
         turn = (ahead - self.way[mover] + np.pi) % (2 * np.pi) - np.pi
         self.way[mover] += np.clip(turn, -_TURN, _TURN)
-        run = min(mm_s, 8.0 * left + 20.0) * max(float(np.cos(turn)), 0.1) / _HZ
+        run = (
+            min(mm_s * self.stroke(mover), 8.0 * left + 20.0) * max(float(np.cos(turn)), 0.1) / _HZ
+        )
         self.at[mover] += min(run, left) * self.ahead(mover)
         return left
 
@@ -167,8 +275,7 @@ def _meet(group: Group, agent: int, target: int, place: Array, turn: float) -> i
     toward = group.at[agent] - group.at[target]
     side = np.arctan2(toward[1], toward[0]) + group.rng.uniform(-0.5, 0.5)
     group.face(target, float(side - np.arctan2(place[1], place[0])))
-    ahead = group.ahead(target)
-    goal = group.at[target] + place[0] * ahead + place[1] * np.array([-ahead[1], ahead[0]])
+    goal = group.at[target] + place[0] * group.ahead(target) + place[1] * group.left(target)
     out = (goal - middle) / np.linalg.norm(goal - middle)
     start = goal + float(group.rng.uniform(90.0, 120.0)) * out
     group.walk(agent, start, 180.0, others, near_mm=15.0)
@@ -202,7 +309,7 @@ def _leave(group: Group, agent: int, target: int, fast: bool = False) -> None:
 def _play(group: Group, agent: int, target: int, action: str) -> None:
     """One encounter from meeting to leaving; an animal apart only walks."""
     rng, spines = group.rng, group.spine
-    wide = _WIDE_MM * float(spines[[agent, target]].mean()) / 65.0
+    wide = group.kind.wide * float(spines[[agent, target]].mean()) / 65.0
     side = float(rng.choice([-1.0, 1.0]))
     nose, other = _AHEAD * spines[agent], spines[target]
     seconds = float(rng.uniform(1.0, 2.5))
@@ -212,6 +319,7 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
         if action == "cross":  # each to where the other was, past it on one side
             way = group.at[target] - group.at[agent]
             aside = np.array([-way[1], way[0]]) / np.linalg.norm(way) * rng.uniform(22.0, 40.0)
+            aside *= group.kind.wide / 36.0
             goals, shy = [group.at[target] + aside, group.at[agent] - aside], ([], [])
         for _ in range(int(3.0 * _HZ)):
             for k, mover in enumerate((agent, target)):
@@ -219,8 +327,8 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
                     group.step(mover, goals[k], 170.0, shy[k])
             group.frame()
         return
-    if action in ("follow", "chase"):
-        _pursue(group, agent, target, action == "chase")
+    if action in ("follow", "chase") or (group.kind.swims and action == "side_by_side_same"):
+        _pursue(group, agent, target, action, side * (wide + 3.0))
         return
     if action == "avoid":
         _shun(group, agent, target)
@@ -256,26 +364,28 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
     group.act(agent, target, "nose_to_side" if action == "escape" else action, begun)
     if action == "huddle":  # they rest side by side
         group.act(agent, target, "side_by_side_same", begun)
-    if action == "mount":
-        group.wait(0.3)
-    leaver = target if action == "escape" or rng.random() < 0.3 else agent
-    if action == "mount":
-        leaver = target
+    group.wait(0.3 * (action == "mount"))
+    leaves = action == "escape" or rng.random() < 0.3 or action == "mount"
+    leaver = target if leaves else agent
     _leave(group, leaver, agent + target - leaver, action == "escape")
 
 
-def _pursue(group: Group, agent: int, target: int, fast: bool) -> None:
-    """Follow or chase: the agent goes along the target's path, about a body length behind."""
+def _pursue(group: Group, agent: int, target: int, action: str, aside: float) -> None:
+    """Follow or chase: the agent goes along the target's path, about a body length behind; or it
+    comes up to it from there on one side, `aside` to the left, and goes with it.
+    """
     rng, behind = group.rng, 0.5 * float(group.spine[[agent, target]].sum())
     behind += float(rng.uniform(8.0, 30.0))
-    place = np.array([-behind, 0.0])
-    _meet(group, agent, target, place, 0.0)
-    trail = [group.at[agent].copy()]
-    trail += [group.at[agent] + s * (group.at[target] - group.at[agent]) for s in (0.33, 0.67, 1.0)]
-    pace = float(rng.uniform(380.0, 450.0) if fast else rng.uniform(120.0, 230.0))
+    least, aside = (behind, 0.0) if action in ("follow", "chase") else (4.0, aside)
+    _meet(group, agent, target, np.array([-behind, aside]), 0.0)
+    trail = [group.at[agent] - aside * group.left(target)]
+    trail += [trail[0] + s * (group.at[target] - trail[0]) for s in (0.33, 0.67, 1.0)]
+    pace = float(rng.uniform(*((380.0, 450.0) if action == "chase" else (120.0, 230.0))))
     begun, round_mm = len(group.rows), float(rng.choice([-1.0, 1.0]) * rng.uniform(70.0, 90.0))
     for i in range(int(rng.uniform(1.6, 2.6) * _HZ)):
-        run = pace / _HZ * min(1.0, (i + 1) / 8.0)
+        begun += behind > least
+        behind = max(behind - 6.0, least)
+        run = pace * group.stroke(target) / _HZ * min(1.0, (i + 1) / 8.0)
         group.way[target] += run / round_mm
         group.at[target] += run * group.ahead(target)
         trail.append(group.at[target].copy())
@@ -283,12 +393,16 @@ def _pursue(group: Group, agent: int, target: int, fast: bool) -> None:
         back = np.concatenate([np.cumsum(steps[::-1])[::-1], [0.0]])  # mm behind the target
         here = np.array([np.interp(-behind, -back, axis) for axis in np.array(trail).T])
         then = np.array([np.interp(4.0 - behind, -back, axis) for axis in np.array(trail).T])
-        group.at[agent], way = here, then - here
+        group.at[agent], way = here + aside * group.left(target), then - here
         if np.linalg.norm(way) > 0.1:
             turn = (np.arctan2(way[1], way[0]) - group.way[agent] + np.pi) % (2 * np.pi) - np.pi
             group.way[agent] += np.clip(turn, -_TURN, _TURN)
         group.frame()
-    group.act(agent, target, "chase" if fast else "follow", begun)
+    group.act(agent, target, action, begun)
+    if aside:  # two that turn side by side would touch
+        low, top = group.kind.water
+        group.level[agent] += np.copysign(0.3 * (top - low), 0.5 * (low + top) - group.level[agent])
+        group.wait(0.8)
     _leave(group, agent, target)
 
 
@@ -329,31 +443,36 @@ class _Making(Making):
 
     group: Group
 
-    def _cast(
-        self, species: MouseSpecies, arenas: list[SimulatedScene]
-    ) -> tuple[list[Actor], list[Solid], list[Mesh]]:
+    def _cast(self, arenas: list[SimulatedScene]) -> tuple[list[Actor], list[Solid], list[Mesh]]:
         """The animals of the group, and nothing else."""
-        paths = np.stack(self.group.rows[: self.take.n_frames], axis=1)
-        return [self._mouse(k, path, species, arenas[0]) for k, path in enumerate(paths)], [], []
+        paths = np.stack(self.group.rows, axis=1)
+        return [self._animal(k, path, arenas[0]) for k, path in enumerate(paths)], [], []
 
-    def _mouse(
-        self, which: int, path: Array, species: MouseSpecies, arena: SimulatedScene
-    ) -> Actor:
-        """An animal on its path (n, 5), see `Group.rows`."""
-        spine = float(self.group.spine[which])
-        place, heading = smoothed(path[:, :2], 2.0), smoothed(np.unwrap(path[:, 2]), 2.0)
-        speed = np.linalg.norm(np.gradient(place, axis=0), axis=1) * _HZ / spine
+    def _animal(self, which: int, path: Array, arena: SimulatedScene) -> Actor:
+        """An animal on its path (m, 6), see `Group.rows`."""
+        kind = self.group.kind
+        spine = kind.unit * float(self.group.spine[which])
+        path[:, 2] = np.unwrap(path[:, 2])
+        frames = np.arange(self.take.n_frames) * (_HZ / kind.hz)
+        path = np.stack([np.interp(frames, np.arange(len(path)), row) for row in path.T], axis=1)
+        place, heading = kind.unit * smoothed(path[:, [0, 1, 5]], 2.0), smoothed(path[:, 2], 2.0)
+        speed = np.linalg.norm(np.gradient(place[:, :2], axis=0), axis=1) * kind.hz / spine
         kinds = np.where(path[:, 3] > 0, _HUNCH, 0)
-        animal = draw_mouse(
+        animal = draw_animal(
             self.seed,
             which,
-            species,
+            self.species,
             arena,
             replace(self.take, spine_mm=spine),
             timing_of("always", self.take.n_frames),
-            lambda rng, n: (kinds, speed),
+            (lambda rng, n, step_s: strokes(speed, heading, step_s))
+            if kind.swims
+            else (lambda rng, n: (kinds, speed)),
             lambda rng, scene, spine_mm, mm_s: (place, heading),
+            kind.going,
         )
+        if kind.swims:
+            return animal
         return _risen(_aligned(animal, heading), smoothed(path[:, 4], 4.0))
 
 
@@ -383,43 +502,60 @@ def film_group(
     seed: int,
     n_frames: int,
     *,
+    animal: str = "mouse",
     animals: int = 2,
     apart: float = 0.0,
-    encounters: Sequence[str] = ENCOUNTERS,
-    sensor: Sensor = KINECT_V2_SENSOR,
+    encounters: Sequence[str] = (),
+    sensor: Sensor | None = None,
     family: str = "other",
     spine_mm: float | None = None,
 ) -> tuple[RenderedRecording, list[Act]]:
-    """A recording of mice that interact, and what they did.
+    """A recording of animals that interact, and what they did.
 
     Args:
         seed: seed of all random numbers.
-        n_frames: its length, at 30 frames/s.
+        n_frames: its length, at 30 frames/s (fish: 50).
+        animal: their kind, of `KINDS`.
         animals: their number, 2 to 4.
         apart: difference in length between one animal and the next, share.
-        encounters: the acts, of `ENCOUNTERS`.
-        sensor: the camera's make.
+        encounters: the acts; () are all that this kind does.
+        sensor: the camera's make; None is the usual one.
         family: of body shapes, see `body.variation`.
         spine_mm: length of the longest animal, mm; None draws it.
 
     Returns:
         The recording with the truth of all animals, and the acts within it.
     """
-    recipe = RECIPES["plain"]
-    take = Take(n_frames, sensor, family=family, spine_mm=spine_mm, name=f"pair-{seed}")
-    making = Making(recipe, seed, take)
-    rng = np.random.default_rng([seed, 78])
-    base = spine_mm or float(rng.uniform(60.0, 74.0))
-    group = Group(
-        rng, making._arenas()[0], base * (1.0 + apart) ** -np.arange(animals, dtype=float)
+    kind = KINDS[animal]
+    take = Take(
+        n_frames,
+        sensor or kind.sensors[0],
+        family=family,
+        spine_mm=spine_mm,
+        name=f"pair-{seed}" if animal == "mouse" else f"pair-{animal}-{seed}",
     )
-    while len(group.rows) < n_frames:
-        for action in rng.permutation(encounters):
-            agent, target = rng.permutation(animals)[:2]
+    rng, deep = (np.random.default_rng([seed, part]) for part in (78, 79))
+    base = (spine_mm or float(rng.uniform(*kind.lengths_mm))) / kind.unit
+    spines = base * (1.0 + apart) ** -np.arange(animals, dtype=float)
+    arena = Making(kind.recipe, seed, take)._arenas()[0]
+    T = arena.T_arena_camera
+    arena = replace(
+        arena,
+        T_arena_camera=SE3(T.rotation, T.translation / kind.unit),
+        centre=arena.centre / kind.unit,
+        half=arena.half / kind.unit,
+    )
+    group = Group(rng, deep, arena, spines, kind)
+    while len(group.rows) * kind.hz / _HZ < n_frames:
+        for action in rng.permutation(encounters or kind.encounters):
+            agent, target = map(int, rng.permutation(animals)[:2])
+            group.dive(agent, target, action)
             group.wait(float(rng.uniform(0.5, 1.0)))
-            _play(group, int(agent), int(target), str(action))
-    filmed = _Making(recipe, seed, take, group)
-    within = [
-        act._replace(stop=min(act.stop, n_frames)) for act in group.acts if act.start < n_frames
+            _play(group, agent, target, str(action))
+    filmed = _Making(kind.recipe, seed, take, group, species=kind.species())
+    acts = [
+        act._replace(start=round(act.start * kind.hz / _HZ), stop=round(act.stop * kind.hz / _HZ))
+        for act in group.acts
     ]
+    within = [act._replace(stop=min(act.stop, n_frames)) for act in acts if act.start < n_frames]
     return filmed.recording(), within

@@ -235,16 +235,16 @@ class Ground:
     within: NDArray[np.bool_]
 
     @staticmethod
-    def draw(rng: np.random.Generator, arena: SimulatedScene) -> "Ground":
-        """Draw a floor with random unevenness."""
+    def draw(rng: np.random.Generator, arena: SimulatedScene, scale: float = 1.0) -> "Ground":
+        """Draw a floor with random unevenness, see `scene.SceneSpec` for its scale."""
         x, y = (
             np.arange(-reach - 2 * _GRID_MM, reach + 2 * _GRID_MM + 0.1, _GRID_MM)
             for reach in arena.half
         )
         local = np.stack(np.meshgrid(x, y), axis=-1)
-        heights = unevenness(rng, local, most=0.6)
+        heights = unevenness(rng, local, scale, most=0.6)
         clearance = arena.wall_clearance(arena.centre + turned(local, arena.yaw))
-        heights += rounding(rng, clearance, 8.0, 18.0)
+        heights += rounding(rng, clearance, 8.0, 18.0, scale)
         return Ground(arena, x, y, heights, clearance > -1.5 * _GRID_MM)
 
     def mesh(self, bedding: Array | float = 0.0) -> Mesh:

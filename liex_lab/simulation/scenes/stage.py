@@ -4,40 +4,53 @@ Body, posture and path of an animal are drawn from the seed alone, not from the 
 animal behaves the same in every scene of a seed, as far as the arena permits.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from liex_lab.arrays import Array, NDArray
+from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
-from liex_lab.simulation.locomotion import Path, Script, free_path, smoothed, walk, waver
+from liex_lab.simulation.locomotion import (
+    Path,
+    Script,
+    Strokes,
+    free_path,
+    smoothed,
+    walk,
+    waver,
+)
 from liex_lab.simulation.recording import Actor, Take
 from liex_lab.simulation.scene import SimulatedScene
-from liex_lab.simulation.species import MouseSpecies
+from liex_lab.simulation.species import Species
 
 _RATE_HZ = 30.0
 _TRIES = 60
 
 
-def draw_mouse(
+def draw_animal(
     seed: int,
     which: int,
-    species: MouseSpecies,
+    species: Species,
     arena: SimulatedScene,
     take: Take,
     timing: tuple[NDArray[np.int64], NDArray[np.bool_]],
-    script: Script | None = None,
+    script: Script | Strokes | None = None,
     path: Path | None = None,
+    going: Callable[..., tuple[Pose, Array]] = walk,
 ) -> Actor:
-    """A mouse that walks in an arena.
+    """An animal that moves in an arena.
 
     Args:
         seed: of the recording.
         which: number of the animal.
-        species: the mouse.
+        species: the animal's.
         arena: the arena.
         take: its length and the family of its body's shape.
         timing: index of the moment of its walk in each frame (n,), and its presence (n,).
-        script: its activity, see `locomotion.walk`.
+        script: its activity, see `going`.
         path: its path, likewise.
+        going: its locomotion, `locomotion.walk` or `locomotion.swim`.
     """
     moments, present = timing
     body = np.random.default_rng([seed, which, 1])
@@ -45,16 +58,17 @@ def draw_mouse(
     spine = float(drawn if take.spine_mm is None else take.spine_mm)
     shape = species.shapes(body, take.family, 1)
     n_moments = int(moments.max()) + 1
-    going, tail = (np.random.default_rng([seed, which, part]) for part in (2, 3))
-    pose, girth = walk(going, arena, species.skeleton, shape, spine, n_moments, script, path)
-    first = species.bends(tail, 1)
-    bends = first + waver(tail, (n_moments, first.shape[1]))
+    motion, tail = (np.random.default_rng([seed, which, part]) for part in (2, 3))
+    pose, girth = going(motion, arena, species.skeleton, shape, spine, n_moments, script, path)
+    bends = species.bends(tail, 1)
+    if bends is not None:
+        bends = (bends + waver(tail, (n_moments, bends.shape[1])))[moments]
     asleep = np.diff(moments, prepend=moments[0] - 1) == 0
     # share of the girth; breaths per frame
     breath = 1.0 + 0.012 * np.sin(2 * np.pi * 2.5 * np.arange(len(moments)) / _RATE_HZ)
     girth = girth[moments] * np.where(asleep, breath, 1.0)
     surface = Surface.of(species.skeleton)
-    return Actor(surface, spine, shape, pose[moments], girth, bends[moments], present)
+    return Actor(surface, spine, shape, pose[moments], girth, bends, present)
 
 
 def timing_of(presence: str, n_frames: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
