@@ -33,9 +33,8 @@ def test_two_fish_that_cross_are_both_measured_and_keep_their_names() -> None:
     true = [camera @ one.joints for one in recording.stage.actors]
     gaps = [[error_of(one.joints_camera, joints) for one in found] for joints in true]
     off_mm = np.moveaxis(np.array(gaps, float), -1, 0)
-    counts = track_counts(
-        (off_mm / KINDS["fish"].unit).astype(np.float64), recording.times_ns * 1e-9
-    )
+    seconds = recording.times_ns.astype(float) * 1e-9
+    counts = track_counts(off_mm / KINDS["fish"].unit, seconds)
     figures = track_figures(counts)
     assert counts["swaps"] == 0
     assert (figures["idf1"] or 0.0) > 0.95, said
