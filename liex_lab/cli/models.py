@@ -533,6 +533,14 @@ def evaluate_several(
         bool,
         typer.Option("--sealed", help="Use the held-out split; not for development."),
     ] = False,
+    courses: Annotated[
+        Path | None,
+        typer.Option(
+            "--courses",
+            exists=True,
+            help="Pose file of JABS with identities (HDF5): virtual mice go where real ones went.",
+        ),
+    ] = None,
     *,
     progress: Progress,
 ) -> Result:
@@ -543,6 +551,7 @@ def evaluate_several(
         n_frames=n_frames,
         n_recordings=n_recordings,
         sealed=sealed,
+        courses=courses,
         progress=progress,
     )
 

@@ -3,13 +3,16 @@
 Groups of mice or fish that interact (`simulation.scenes.groups`) are rendered, measured as `liex
 run` does, and the tables scored: identity, errors apart and in contact, abstention and
 interactions. Conditions alternate: equal lengths or 15 % apart, three makes of cameras (for fish
-three lenses), and builds that models were trained on or not. Limits are those of mice over the
-animal's length. The sealed split uses other seeds, which appear in no development.
+three lenses), and builds that models were trained on or not; or virtual mice go where real ones
+went. Limits are those of mice over the animal's length. The sealed split uses other seeds, which
+appear in no development.
 """
 
 import hashlib
 import time
 from collections.abc import Mapping, Sequence
+from itertools import combinations
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -36,6 +39,7 @@ from liex_lab.evaluation.several import (
 from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.simulation.recording import RenderedRecording
+from liex_lab.simulation.scenes.courses import film_courses, read_courses
 from liex_lab.simulation.scenes.groups import KINDS, Act, film_group
 from liex_lab.tracking.track import spans
 
@@ -54,6 +58,7 @@ def evaluate_several(
     n_frames: int = 1800,
     n_recordings: int = 6,
     sealed: bool = False,
+    courses: str | Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Measure rendered groups of animals, and score the tables, see `SEVERAL_PROTOCOL`.
@@ -64,6 +69,8 @@ def evaluate_several(
         n_frames: length of each recording.
         n_recordings: of different seeds, 1 to 48.
         sealed: use the sealed seeds, which are not for development.
+        courses: pose file of JABS with identities: the mice go where real ones went, see
+            `simulation.scenes.courses`, and all their groups of this number take turns.
         progress: called recording by recording.
 
     Returns:
@@ -80,25 +87,35 @@ def evaluate_several(
             f"there are 1 to {len(seeds)} recordings of 2 to 4 animals, got {n_recordings} of "
             f"{animals}"
         )
+    if courses is not None and (animal != "mouse" or sealed):
+        raise LiexError("courses are those of mice, and have no sealed split; leave these out")
+    backs = _groups(Path(courses), animals, n_frames) if courses is not None else []
     results: dict[str, list[Counts]] = {}
     messages: list[str] = []
     for k, seed in enumerate(seeds[:n_recordings]):
         progress(k, n_recordings, f"measuring group {k + 1}")
         apart, family = 0.15 * (k % 2), ("train", "other")[k // 2 % 2]
-        recording, acts = film_group(
-            seed,
-            n_frames,
-            animal=animal,
-            animals=animals,
-            apart=apart,
-            sensor=KINDS[animal].sensors[k % 3],
-            family=family,
-        )
+        condition = "15 % apart" if apart else "equal"
+        sensor = KINDS[animal].sensors[k % 3]
+        acts: list[Act] = []
+        if backs:
+            recording = film_courses(backs[k % len(backs)], seed, sensor, family)
+            condition = "real courses"
+        else:
+            recording, acts = film_group(
+                seed,
+                n_frames,
+                animal=animal,
+                animals=animals,
+                apart=apart,
+                sensor=sensor,
+                family=family,
+            )
         recording.files.known_digest = hashlib.sha256(
-            f"{recording.name} {animals} {apart} {n_frames}".encode()
+            f"{recording.name} {animals} {condition} {n_frames}".encode()
         ).hexdigest()
         one, sentences = _counts(recording, animal, acts)
-        for name in ("all", "15 % apart" if apart else "equal", f"builds: {family}"):
+        for name in ("all", condition, f"builds: {family}"):
             results.setdefault(name, []).append(one)
         messages += [sentence for sentence in sentences if sentence not in messages]
     return {
@@ -110,6 +127,14 @@ def evaluate_several(
         "n_frames": n_frames,
         "protocol": SEVERAL_PROTOCOL,
     }
+
+
+def _groups(courses: Path, animals: int, n_frames: int) -> list[Array]:
+    """The backs (n, animals, 4, 2) mm of all groups of real mice of this number."""
+    backs = read_courses(courses)[:n_frames]
+    if backs.shape[1] < animals:
+        raise LiexError(f"{courses} has {backs.shape[1]} mice, got {animals}; state fewer")
+    return [backs[:, some] for some in combinations(range(backs.shape[1]), animals)]
 
 
 def _counts(
