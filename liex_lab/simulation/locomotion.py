@@ -31,8 +31,6 @@ from liex_lab.simulation.pose_prior import (
 from liex_lab.simulation.scene import SimulatedScene, floor_point
 
 Script = Callable[[np.random.Generator, int], tuple[NDArray[np.int64], Array]]
-# speed, turning, and the tail's amplitude and phase, see `_swim_script`
-Strokes = Callable[[np.random.Generator, int, float], tuple[Array, Array, Array, Array]]
 Path = Callable[[np.random.Generator, SimulatedScene, float, Array], tuple[Array, Array]]
 
 _RATE_HZ = 30.0
@@ -230,7 +228,7 @@ def swim(
     shape: Body,
     length: float,
     n_frames: int,
-    script: Strokes | None = None,
+    script: Callable[..., tuple[Array, Array, Array, Array]] | None = None,
     path: Path | None = None,
     step_s: float = 0.02,
 ) -> tuple[Pose, Array]:
@@ -256,8 +254,8 @@ def swim(
     roll = np.radians(smoothed(rng.normal(0.0, 12.0, n_frames), 8.0))
     if path is not None:
         position, heading = path(rng, scene, length, speed * length)
-        climb = np.gradient(position[:, 2]) / step_s / length  # body lengths/s
-        pitch = np.radians(25.0) * np.tanh(climb / (speed + 0.5))
+        climb = np.gradient(position[:, 2]) / step_s / length / (speed + 0.5)
+        pitch = np.radians(25.0) * np.tanh(climb)
     else:
         level = hung(skeleton, yaw, root_rotation(np.zeros(n_frames), pitch, roll), size)
         low, high = clearance(skeleton, level, shape[0].broadcast(n_frames), size)

@@ -233,16 +233,14 @@ class Rows:
             position = _NOWHERE
             if reason == HIDDEN and len(observed_rows):
                 # the last observed position before, or the first one after it
-                last = max(0, int(np.searchsorted(observed_rows, start)) - 1)
-                row = int(observed_rows[last])
-                x, y = self.track.centroid_mm[row, :2]
-                away = [
-                    np.linalg.norm(one[[row, start], :2] - [x, y], axis=1) for one in self.others
+                last = observed_rows[max(0, int(np.searchsorted(observed_rows, start)) - 1)]
+                x, y = self.track.centroid_mm[last, :2]
+                off = [
+                    np.linalg.norm(one[[last, start], :2] - [x, y], axis=1) for one in self.others
                 ]
-                if not (
-                    np.array(away) < self.track.spine_mm[row]
-                ).any():  # it did not hide, another animal was over it
-                    position = (float(x), float(y))
+                # it did not hide where another animal was over it
+                under = (np.array(off) < self.track.spine_mm[last]).any()
+                position = _NOWHERE if under else (float(x), float(y))
             found.append((*span, stop - start, reason, *position))
         found.sort()
         names = (*_SPAN_NAMES, "n_frames_missing", "reason", "x_mm", "y_mm")

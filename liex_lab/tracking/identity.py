@@ -36,6 +36,7 @@ _GAP_S = 0.1  # time without all animals in view over which they are continued
 _VELOCITY_S = 0.2  # time over which their velocity is measured
 _STRETCH_SD = 0.04  # that of its mean over a stretch: 0.015 in virtual mice, with a margin
 _PLACE_SHARE = 0.15  # standard deviation of a position beside another animal, lengths
+_NO_TAIL = 1e6  # cost above which costs of an exchange grow logarithmically, nats
 _MOST_NATS = 9.0  # of one frame
 _NOISE_MM = 0.3  # distance of a body from the depth below which there is no better one
 _MOST_MISFIT = np.log(2.0)  # of bodies in contact over that of free ones
@@ -260,8 +261,11 @@ def doubt(crossings: Sequence[Crossing]) -> str:
 
 
 def _moves(observed: Observations, subject: Subject) -> Array:
-    """Cost (m - 1, N, N) of one animal's way from each component to each of the next frame."""
-    tuning = TrackingParameters.of(subject.skeleton.name).chain
+    """Cost (m - 1, N, N) of one animal's way from each component to each of the next frame.
+
+    One animal may dart; two that dart to each other's places are not to be expected.
+    """
+    tuning = replace(TrackingParameters.of(subject.skeleton.name).chain, tail=_NO_TAIL)
     chain = HypothesisAssociation(subject.skeleton, subject.length_mm, tuning, several=True)
     n, n_hypotheses = observed.score.shape
     error = observed.error_mm.copy()

@@ -79,13 +79,11 @@ def evaluate_several(
     Raises:
         LiexError: there are not so many recordings, or animals, or no groups of them.
     """
-    if animal not in KINDS:
-        raise LiexError(f"there are groups of {' and '.join(KINDS)} alone, got {animal}")
     seeds = SEALED_SEEDS if sealed else SEEDS
-    if not (1 <= n_recordings <= len(seeds) and 2 <= animals <= 4):
+    if not (1 <= n_recordings <= len(seeds) and 2 <= animals <= 4 and animal in KINDS):
         raise LiexError(
             f"there are 1 to {len(seeds)} recordings of 2 to 4 animals, got {n_recordings} of "
-            f"{animals}"
+            f"{animals} ({animal}); they are of {' or '.join(KINDS)}"
         )
     if courses is not None and (animal != "mouse" or sealed):
         raise LiexError("courses are those of mice, and have no sealed split; leave these out")
@@ -228,8 +226,9 @@ def _of_gaps(gaps: Array, time_s: Array, limits: InteractionThresholds) -> list[
             if time_s[stop - 1] - time_s[start] >= limits.isolated_s
         ]
         for b in range(a):
-            near = spans(gaps[:, a, b] <= limits.contact_mm)
-            found += [(a, b, "contact", *span) for span in near]
+            found += [
+                (a, b, "contact", *span) for span in spans(gaps[:, a, b] <= limits.contact_mm)
+            ]
     return found
 
 

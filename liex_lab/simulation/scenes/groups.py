@@ -15,7 +15,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from liex_lab.arrays import Array
-from liex_lab.body.pose import Pose
 from liex_lab.geometry import SE3, so3
 from liex_lab.simulation.locomotion import GLIDE_S, smoothed, strokes, swim, walk
 from liex_lab.simulation.recording import Actor, RenderedRecording, Take
@@ -35,6 +34,7 @@ from liex_lab.simulation.species import FishSpecies, MouseSpecies, Species
 
 _HZ = 30.0
 _TURN = 6.0 / _HZ  # rad per frame, the fastest turn
+_AWAY = np.full(2, np.inf)
 _WALKERS = ("side_by_side_opposite", "mount", "huddle")  # acts that swimmers do not do
 _HUNCH = 3  # of `pose_prior.KINDS`, the posture of animals that rest
 _AHEAD, _BEHIND = 0.5, 0.45  # from the body's centre to the nose and to the tail base, spines
@@ -72,7 +72,6 @@ class Kind:
         encounters: the acts.
         water: lowest and highest position above the floor, in `unit`.
         swims: whether it goes in bouts, keeps off the walls, and turns head first.
-        going: its locomotion.
     """
 
     species: Callable[[], Species]
@@ -85,7 +84,6 @@ class Kind:
     encounters: tuple[str, ...] = ENCOUNTERS
     water: tuple[float, float] = (0.0, 0.0)
     swims: bool = False
-    going: Callable[..., tuple[Pose, Array]] = walk
 
 
 KINDS: Final[Mapping[str, Kind]] = {
@@ -112,7 +110,6 @@ KINDS: Final[Mapping[str, Kind]] = {
         encounters=tuple(word for word in ENCOUNTERS if word not in _WALKERS),
         water=(35.0, 200.0),
         swims=True,
-        going=swim,
     ),
 }
 
@@ -158,15 +155,18 @@ class Group:
         self.resting, self.mounting = np.zeros((2, len(spines)))
 
     def _spot(
-        self, mover: int, apart_mm: float = 130.0, middle: Array | None = None, far_mm: float = 0.0
+        self, mover: int, apart_mm: float = 130.0, middle: Array = _AWAY, far_mm: float = 1.0
     ) -> Array:
         """A free place, away from all other animals and `far_mm` from a point, or the best."""
         others = self.at[np.arange(len(self.at)) != mover]
         spots = [free_spot(self.rng, self.arena, 0.8 * float(self.spine[mover])) for _ in range(24)]
-        room = [np.linalg.norm(others - spot, axis=1).min() / apart_mm for spot in spots]
-        if middle is not None:
-            far = [float(np.linalg.norm(spot - middle)) / far_mm for spot in spots]
-            room = [min(one) for one in zip(room, far, strict=True)]
+        room = [
+            min(
+                np.linalg.norm(others - spot, axis=1).min() / apart_mm,
+                float(np.linalg.norm(spot - middle)) / far_mm,
+            )
+            for spot in spots
+        ]
         good = np.array(room) > 1.0
         return spots[int(np.argmax(good if good.any() else room))]
 
@@ -213,8 +213,8 @@ class Group:
             toward = self.at[other] - self.at[mover]
             far = float(np.linalg.norm(toward))
             off = (ahead - np.arctan2(toward[1], toward[0]) + np.pi) % (2 * np.pi) - np.pi
-            clear = np.arcsin(min(1.0, _ROOM_MM / max(far, 1.0)))
-            clear += max(0.0, 1.0 - far / _ROOM_MM)  # outwards, if it is too near
+            outwards = max(0.0, 1.0 - far / _ROOM_MM)  # if it is too near
+            clear = np.arcsin(min(1.0, _ROOM_MM / max(far, 1.0))) + outwards
             if far < left + 40.0 and abs(off) < clear:
                 ahead += (np.sign(off) or 1.0) * (clear - abs(off))
         turn = (ahead - self.way[mover] + np.pi) % (2 * np.pi) - np.pi
@@ -259,7 +259,7 @@ class Group:
         self.acts.append(Act(agent, target, action, start, len(self.rows)))
 
 
-def _meet(group: Group, agent: int, target: int, place: Array, turn: float) -> int:
+def _meet(group: Group, agent: int, target: int, place: tuple[float, float], turn: float) -> int:
     """Approach an animal that stands in the middle: go straight to a place (forward, left; mm) in
     its frame, then stand at an angle `turn` to it; returns the frame of arrival.
     """
@@ -269,8 +269,8 @@ def _meet(group: Group, agent: int, target: int, place: Array, turn: float) -> i
     for k in every:
         room = 150.0 if k == agent else 190.0
         if k != target and np.linalg.norm(group.at[k] - middle) < room:
-            spot = group._spot(k, 150.0, middle, room)
-            group.walk(k, spot, 200.0, [one for one in every if one != k])
+            shy = [one for one in every if one != k]
+            group.walk(k, group._spot(k, 150.0, middle, room), 200.0, shy)
     group.walk(target, middle, 150.0, [k for k in every if k != target])
     toward = group.at[agent] - group.at[target]
     side = np.arctan2(toward[1], toward[0]) + group.rng.uniform(-0.5, 0.5)
@@ -295,8 +295,8 @@ def _leave(group: Group, agent: int, target: int, fast: bool = False) -> None:
     far = float(group.rng.uniform(*((150.0, 180.0) if fast else (110.0, 150.0))))
     ways = np.arctan2(away[1], away[0]) + group.rng.uniform(-0.8, 0.8, 8)
     goals = group.at[agent] + far * np.stack([np.cos(ways), np.sin(ways)], axis=1)
-    others = np.delete(group.at, agent, axis=0)
-    room = np.linalg.norm(goals[:, None] - others, axis=2).min(axis=1)
+    off = goals[:, None] - np.delete(group.at, agent, axis=0)
+    room = np.linalg.norm(off, axis=2).min(axis=1)
     way, goal = float(ways[room.argmax()]), goals[room.argmax()]
     if not fast:
         group.face(agent, way)
@@ -345,8 +345,7 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
         "huddle": ((0.0, side * 0.82 * wide), 0.0),
         "mount": ((-_BEHIND * other - 6.0 - nose, 0.0), 0.0),
     }
-    place, turn = places[action]
-    arrived = _meet(group, agent, target, np.array(place), turn)
+    arrived = _meet(group, agent, target, *places[action])
     begun = arrived if action.startswith("nose") else len(group.rows)
     if action == "huddle":
         group.resting[[agent, target]] = 1.0
@@ -359,14 +358,12 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
         begun = len(group.rows)
         group.mounting[agent] = 1.0
     group.wait(seconds)
-    group.mounting[agent] = 0.0
-    group.resting[[agent, target]] = 0.0
+    group.mounting[agent] = group.resting[[agent, target]] = 0.0
     group.act(agent, target, "nose_to_side" if action == "escape" else action, begun)
     if action == "huddle":  # they rest side by side
         group.act(agent, target, "side_by_side_same", begun)
     group.wait(0.3 * (action == "mount"))
-    leaves = action == "escape" or rng.random() < 0.3 or action == "mount"
-    leaver = target if leaves else agent
+    leaver = target if action == "escape" or rng.random() < 0.3 or action == "mount" else agent
     _leave(group, leaver, agent + target - leaver, action == "escape")
 
 
@@ -377,7 +374,7 @@ def _pursue(group: Group, agent: int, target: int, action: str, aside: float) ->
     rng, behind = group.rng, 0.5 * float(group.spine[[agent, target]].sum())
     behind += float(rng.uniform(8.0, 30.0))
     least, aside = (behind, 0.0) if action in ("follow", "chase") else (4.0, aside)
-    _meet(group, agent, target, np.array([-behind, aside]), 0.0)
+    _meet(group, agent, target, (-behind, aside), 0.0)
     trail = [group.at[agent] - aside * group.left(target)]
     trail += [trail[0] + s * (group.at[target] - trail[0]) for s in (0.33, 0.67, 1.0)]
     pace = float(rng.uniform(*((380.0, 450.0) if action == "chase" else (120.0, 230.0))))
@@ -469,11 +466,10 @@ class _Making(Making):
             if kind.swims
             else (lambda rng, n: (kinds, speed)),
             lambda rng, scene, spine_mm, mm_s: (place, heading),
-            kind.going,
+            swim if kind.swims else walk,
         )
-        if kind.swims:
-            return animal
-        return _risen(_aligned(animal, heading), smoothed(path[:, 4], 4.0))
+        risen = smoothed(path[:, 4], 4.0)
+        return animal if kind.swims else _risen(_aligned(animal, heading), risen)
 
 
 def _aligned(animal: Actor, heading: Array) -> Actor:
@@ -546,16 +542,17 @@ def film_group(
         half=arena.half / kind.unit,
     )
     group = Group(rng, deep, arena, spines, kind)
-    while len(group.rows) * kind.hz / _HZ < n_frames:
+    while len(group.rows) * kind.hz < n_frames * _HZ:
         for action in rng.permutation(encounters or kind.encounters):
             agent, target = map(int, rng.permutation(animals)[:2])
             group.dive(agent, target, action)
             group.wait(float(rng.uniform(0.5, 1.0)))
             _play(group, agent, target, str(action))
     filmed = _Making(kind.recipe, seed, take, group, species=kind.species())
-    acts = [
-        act._replace(start=round(act.start * kind.hz / _HZ), stop=round(act.stop * kind.hz / _HZ))
+    frames = kind.hz / _HZ
+    within = [
+        act._replace(start=start, stop=min(round(act.stop * frames), n_frames))
         for act in group.acts
+        if (start := round(act.start * frames)) < n_frames
     ]
-    within = [act._replace(stop=min(act.stop, n_frames)) for act in acts if act.start < n_frames]
     return filmed.recording(), within

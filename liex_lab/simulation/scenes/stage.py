@@ -5,6 +5,7 @@ animal behaves the same in every scene of a seed, as far as the arena permits.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,6 @@ from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
 from liex_lab.simulation.locomotion import (
     Path,
-    Script,
-    Strokes,
     free_path,
     smoothed,
     walk,
@@ -35,7 +34,7 @@ def draw_animal(
     arena: SimulatedScene,
     take: Take,
     timing: tuple[NDArray[np.int64], NDArray[np.bool_]],
-    script: Script | Strokes | None = None,
+    script: Callable[..., Any] | None = None,
     path: Path | None = None,
     going: Callable[..., tuple[Pose, Array]] = walk,
 ) -> Actor:
