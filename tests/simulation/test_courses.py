@@ -51,7 +51,7 @@ def test_virtual_mice_are_where_the_real_ones_were(tmp_path: Path) -> None:
     backs = read_courses(written(tmp_path / "pose_est_v5.h5"))
     true = 0.8 * backs_px().swapaxes(0, 1) * [1.0, -1.0]  # rows count downwards
     off = (backs - true) - (backs - true).mean(axis=(0, 1, 2))
-    assert np.abs(off).max() < 1.5
+    assert np.abs(off).max() < 2.5  # smoothed at both ends
     recording = film_courses(backs, 3, KINECT_V2_SENSOR, "train")
     actors = recording.stage.actors
     middles = np.stack([one.joints[..., :2].mean(axis=1) for one in actors], axis=1)
