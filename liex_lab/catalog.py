@@ -4,13 +4,12 @@ A model is an .npz file of arrays; its card is the JSON file of the same name, w
 model's SHA-256. A model whose SHA-256 differs from its card is refused.
 """
 
-import difflib
 import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
-from liex_lab.errors import LiexError, ModelError
+from liex_lab.errors import LiexError, ModelError, did_you_mean
 
 _HERE = Path(__file__).resolve().parent
 MODELS = _HERE / "models"
@@ -92,8 +91,8 @@ def find_file(name: str | Path, folder: Path, suffix: str, what: str, own: str) 
     path = bundled if bundled.is_file() else Path(name)
     if not path.is_file():
         known = sorted(p.stem for p in folder.glob(f"*{suffix}"))
-        near = difflib.get_close_matches(str(name), known, 1)
-        hint = f"did you mean '{near[0]}'" if near else f"bundled are: {', '.join(known) or 'none'}"
+        near = did_you_mean(name, known, "did you mean '{}'")
+        hint = near or f"bundled are: {', '.join(known) or 'none'}"
         raise ModelError(f"there is no {what} '{name}'; {hint}, or give the path of {own}")
     return path
 

@@ -794,7 +794,6 @@ def _table(rows: Sequence[dict[str, Any]], frames: pd.DataFrame) -> pd.DataFrame
                 "stop_frame": int(count[b]),
             }
         )
-    dtypes = {
-        column.name: "str" if column.dtype == "string" else column.dtype for column in schema.BOUTS
-    }
-    return pd.DataFrame(made, columns=list(dtypes)).astype(dtypes)
+    return schema.to_pandas(
+        schema.BOUTS, {one.name: [row[one.name] for row in made] for one in schema.BOUTS}
+    )

@@ -22,6 +22,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+import numba
 import numpy as np
 import pandas as pd
 from liex_lab.dashboards.replay.layouts import replay_blueprint
@@ -222,8 +223,6 @@ def observed(
     Yields:
         Each stretch with its observations; an error in one is raised in its turn.
     """
-    import numba
-
     n_threads = numba.get_num_threads()
     if n_threads < _AT_ONCE or not _may_share():
         for frames in stretches:
@@ -263,8 +262,6 @@ def _may_share() -> bool:
     numba's own threading layer aborts a process in which they do. False if no parallel kernel has
     run yet.
     """
-    import numba
-
     try:
         return numba.threading_layer() in ("omp", "tbb")
     except ValueError:

@@ -1,6 +1,5 @@
 """The sets of figures of a session, a study and a comparison, and their files."""
 
-import difflib
 import io
 import json
 from collections import Counter
@@ -15,7 +14,7 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from liex_lab.behaviour.cohort import SUBJECT, unit_of
-from liex_lab.errors import SessionError
+from liex_lab.errors import SessionError, did_you_mean
 from liex_lab.plan.study import references_first
 from liex_lab.runtime import durable, memory, text_files
 from liex_lab.runtime.progress import Progress, silent
@@ -264,8 +263,7 @@ def check_names(only: Sequence[str], known: Sequence[str]) -> None:
         SessionError: a name is unknown.
     """
     for name in (one for one in only if one not in known):
-        near = difflib.get_close_matches(name, known, 1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(name, known)
         raise SessionError(f"there is no figure '{name}' here: {hint}known are {', '.join(known)}")
 
 

@@ -23,7 +23,7 @@ from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, one_line
 from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.text_files import clock_s, number, read_texts
-from liex_lab.tracking.track import Track
+from liex_lab.tracking.track import Track, spans
 
 HUMAN = "human"
 _NEEDED = ("action", "start_s", "stop_s")
@@ -224,8 +224,8 @@ def match_bouts(
     Returns:
         Matches, bouts found, true bouts.
     """
-    spans = _spans(true)
-    guesses = _spans(found)
+    bouts = spans(true)
+    guesses = spans(found)
     taken = set()
     hits = 0
     for start, stop in guesses:
@@ -233,18 +233,13 @@ def match_bouts(
             (min(stop, b) - max(start, a)) / (max(stop, b) - min(start, a))
             if min(stop, b) > max(start, a)
             else 0.0
-            for a, b in spans
+            for a, b in bouts
         ]
         best = int(np.argmax(shares)) if shares else -1
         if best >= 0 and shares[best] >= overlap and best not in taken:
             taken.add(best)
             hits += 1
-    return hits, len(guesses), len(spans)
-
-
-def _spans(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return hits, len(guesses), len(bouts)
 
 
 def _share(part: int, whole: int) -> float:

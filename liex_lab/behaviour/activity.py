@@ -16,9 +16,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array, Mask, NDArray
+from liex_lab.arrays import Array, ArrayLike, Mask, NDArray
 from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.days import Light
 from liex_lab.behaviour.kinematics import segments

@@ -26,9 +26,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array, NDArray
+from liex_lab.arrays import Array, ArrayLike, NDArray
 
 
 class NotComparable(Exception):

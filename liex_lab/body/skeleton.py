@@ -9,7 +9,6 @@ define the tree, [view] how the animal is viewed, and [surface] the body around 
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, how_to_install, refuse
+from liex_lab.errors import LiexError, did_you_mean, how_to_install, refuse
 from liex_lab.geometry import so3
 from liex_lab.runtime.text_files import read_toml
 
@@ -175,12 +174,8 @@ class Skeleton:
             path = Path(animal)
         if not path.is_file():
             names = sorted(p.stem for p in PRESETS.glob("*.toml"))
-            near = difflib.get_close_matches(str(animal), names, 1)
-            hint = (
-                f"did you mean '{near[0]}'?"
-                if near
-                else f"choose one of {', '.join(names)}, or give a .toml file"
-            )
+            near = did_you_mean(animal, names, "did you mean '{}'?")
+            hint = near or f"choose one of {', '.join(names)}, or give a .toml file"
             raise LiexError(f"there is no skeleton '{animal}': {hint}")
         try:
             table = read_toml(path)

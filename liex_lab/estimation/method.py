@@ -307,7 +307,7 @@ _LENGTHS = (
 )
 
 
-def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
+def method_of(variant: str, skeleton: Skeleton) -> Method:
     """The method of a variant for an animal.
 
     Lengths are the mouse's, scaled by the ratio of home lengths, unless the animal has its own. An
@@ -315,7 +315,7 @@ def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
 
     Args:
         variant: 'default' or 'paper'.
-        skeleton: the animal's skeleton; None is the mouse.
+        skeleton: the animal's skeleton.
 
     Raises:
         PlanError: there is no such variant.
@@ -323,8 +323,6 @@ def method_of(variant: str, skeleton: Skeleton | None = None) -> Method:
     if variant not in METHODS:
         raise PlanError(f"there is no variant '{variant}'; choose one of {', '.join(METHODS)}")
     method = METHODS[variant]
-    if skeleton is None:
-        return method
     scaled = {name: getattr(method, name) * skeleton.relative_size for name in _LENGTHS}
     scaled["camera_view"] = method.camera_view or skeleton.view.frame == VIEWS[1]
     return replace(method, **(scaled | _OWN.get((skeleton.name, variant), {})))

@@ -17,8 +17,6 @@ body is as wide as its outline, and as high as an average animal of that width, 
 deviations that this leaves: the height of a body that swims is not visible from above.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -178,13 +176,13 @@ class ShapePrior:
 
     @staticmethod
     @cache
-    def of(name: str) -> ShapePrior | None:
+    def of(name: str) -> "ShapePrior | None":
         """The prior of an animal by the name of its skeleton; None if absent."""
         path = Path(__file__).with_name("shapes") / f"{name}.npz"
         return ShapePrior.load(path) if path.is_file() else None
 
     @staticmethod
-    def load(path: Path) -> ShapePrior:
+    def load(path: Path) -> "ShapePrior":
         """Read a prior that `save` wrote."""
         with np.load(path) as held:
             height, along = held["unseen"].tolist()
@@ -207,7 +205,7 @@ class ShapePrior:
         }
 
     @staticmethod
-    def fit(clues: Array, labels: Array) -> ShapePrior:
+    def fit(clues: Array, labels: Array) -> "ShapePrior":
         """Fit the regression to sessions of known animals.
 
         Args:
@@ -318,7 +316,7 @@ class Build:
     unseen: tuple[float, float]
 
     @staticmethod
-    def of(prior: ShapePrior, labels: Array, unlike: bool = False) -> Build:
+    def of(prior: ShapePrior, labels: Array, unlike: bool = False) -> "Build":
         """The build stated by labels, with the uncertainty of one estimated from clues.
 
         Args:

@@ -10,8 +10,6 @@ The paper uses the mean-shift mode of the trees' votes instead, see
 `estimation._cascade_kernels.mode_of_votes`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -55,7 +53,7 @@ class Forest:
         """Number of trees."""
         return len(self.roots)
 
-    def quantised(self) -> Forest:
+    def quantised(self) -> "Forest":
         """The forest with leaves rounded to float16, the precision of the model file, so that
         training uses the same forest as estimation.
         """
@@ -63,7 +61,7 @@ class Forest:
         return Forest(self.nodes, self.roots, leaves)
 
     @staticmethod
-    def join(forests: list[Forest]) -> Forest:
+    def join(forests: "list[Forest]") -> "Forest":
         """Join forests, with equally many values per leaf, into one of all their trees; its
         prediction is the mean over all the trees.
         """
@@ -164,7 +162,7 @@ def check_forest(forest: Forest, n_views: int, n_scalars: int, n_values: int) ->
         )
 
 
-def check_samples(forest: Forest, samples: Samples) -> None:
+def check_samples(forest: Forest, samples: "Samples") -> None:
     """Check that samples contain all that the tests of a forest read.
 
     Args:

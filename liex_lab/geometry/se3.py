@@ -17,9 +17,8 @@ from dataclasses import dataclass
 from typing import overload
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array, NDArray
+from liex_lab.arrays import Array, ArrayLike, NDArray
 from liex_lab.geometry import so3
 from liex_lab.runtime.memory import Rows
 

@@ -6,9 +6,8 @@ Small angles use the series of these factors. Vectors are (..., 3) radians, rota
 """
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array, NDArray
+from liex_lab.arrays import Array, ArrayLike, NDArray
 
 _SMALL_EXP = 1e-8  # th^2 below which exp uses its series
 _SMALL_A = 1e-6  # th^2 below which A and its inverse use their series

@@ -16,7 +16,7 @@ import numpy as np
 from liex_lab.actions.ethogram import Ethogram
 from liex_lab.actions.labels import sessions_named, words_of
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, SessionError, refuse
+from liex_lab.errors import LiexError, SessionError, did_you_mean, refuse
 from liex_lab.plan import Plan
 from liex_lab.recordings.recording import Recording
 from liex_lab.sessions import identities
@@ -537,8 +537,7 @@ def _word(session: Session, action: str, new_word: bool) -> str:
     if not word or len(word) > _WORD_LENGTH or not word.isprintable():
         raise LiexError(f"an action is a word of up to {_WORD_LENGTH} letters, got {action!r}")
     if word not in known and not new_word:
-        near = difflib.get_close_matches(word, known, 1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
+        hint = did_you_mean(word, known)
         raise SessionError(
             f"the ethogram has no word '{word}': {hint}known are {', '.join(known) or 'none'}; "
             "--new-word, or `new` after it, makes it one"

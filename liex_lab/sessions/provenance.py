@@ -4,8 +4,6 @@ It is the part of session.json that is known before the first frame, and the met
 Parquet file. Hashes are the first 16 hexadecimal digits of SHA-256 over sorted JSON.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import platform
@@ -116,7 +114,7 @@ class Provenance:
     @staticmethod
     def of(
         recording: Recording, floor: Floor, skeleton: Skeleton, plan: Plan, **more: Any
-    ) -> Provenance:
+    ) -> "Provenance":
         """Provenance of a recording, its floor and the plan.
 
         Args:
@@ -305,7 +303,7 @@ class _Shape(_Section):
     joints_moved: list[Annotated[list[Finite], Field(min_length=3, max_length=3)]] = []
 
     @model_validator(mode="after")
-    def _fit(self) -> _Shape:
+    def _fit(self) -> "_Shape":
         columns = (self.width, self.width_sd, self.height, self.height_sd)
         known = self.residual_mm is not None and self.average_residual_mm is not None
         refuse(
@@ -332,7 +330,7 @@ class _Animal(_Section):
     shape: _Shape | None = None
 
     @model_validator(mode="after")
-    def _fit(self) -> _Animal:
+    def _fit(self) -> "_Animal":
         n = len(self.joints)
         refuse(
             ValueError,
@@ -359,7 +357,7 @@ class _Thumbnail(_Section):
     height_px: Size
 
     @model_validator(mode="after")
-    def _stay(self) -> _Thumbnail:
+    def _stay(self) -> "_Thumbnail":
         if PurePosixPath(self.file).parts[:-1] != (THUMBNAILS,):
             raise ValueError("is an image outside of the session")
         return self

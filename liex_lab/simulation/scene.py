@@ -12,9 +12,8 @@ Arena frame: z up from the floor, the origin at the foot of the camera's perpend
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array, NDArray
+from liex_lab.arrays import Array, ArrayLike, NDArray
 from liex_lab.body._skinning_kernels import joined_faces
 from liex_lab.body.shape import render_mesh
 from liex_lab.geometry import SE3

@@ -3,8 +3,6 @@
 Only this module and `crew` import Dask.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import signal
@@ -14,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -25,17 +23,13 @@ from liex_lab.runtime.processes import n_cores, worker_environment
 
 from .crew import DEATHS, Crew
 
-if TYPE_CHECKING:
-    from distributed import Client, LocalCluster
-
-
 _FORGOTTEN_S = 8.0  # a nanny whose process is gone for so long does not start another one by itself
 WORKERS_EVERY_S = 5.0  # between two checks of this machine's workers
 _NONE_LEFT_S = 60.0  # give up after all worker processes of a study are gone for so long
 
 
 @contextmanager
-def watched(client: Client, inspect: Callable[[], str], every_s: float) -> Iterator[None]:
+def watched(client: Any, inspect: Callable[[], str], every_s: float) -> Iterator[None]:
     """A context in which a thread inspects the cluster periodically.
 
     Args:
@@ -152,7 +146,7 @@ class SlurmTable(BaseModel):
     directives: list[Line] = []
 
     @staticmethod
-    def load(path: str | Path) -> SlurmTable:
+    def load(path: str | Path) -> "SlurmTable":
         """Read the settings from a TOML file; `slurm` is the bundled one.
 
         Raises:
@@ -200,7 +194,7 @@ def queued() -> set[str] | None:
 class KeptJobs:
     """As many jobs of a `dask_jobqueue.SLURMCluster` as sessions are left, up to a number."""
 
-    def __init__(self, client: Client, cluster: Any, n_jobs: int, log_folder: str | None) -> None:
+    def __init__(self, client: Any, cluster: Any, n_jobs: int, log_folder: str | None) -> None:
         """Keep up to `n_jobs` jobs, whose logs are in `log_folder`."""
         self._client, self._cluster, self._n_jobs = client, cluster, n_jobs
         self._logs = log_folder or "the folder where the command was started"
@@ -334,7 +328,7 @@ def crew_of(
             raise
 
 
-def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> LocalCluster:
+def local_cluster(n_tasks: int, workers: int, threads: int, scratch: str) -> Any:
     """Worker processes on this machine, reachable only from it, with keys for this run.
 
     Args:

@@ -6,14 +6,12 @@ one worker; if fewer sessions than workers are left, the workers share the shard
 during which more than three workers died is quarantined.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from liex_lab.errors import RecordingError, StudyError
 from liex_lab.plan.study import PlannedSession
@@ -31,10 +29,6 @@ from .status import (
     input_stamp,
     review_note,
 )
-
-if TYPE_CHECKING:
-    from distributed import Client
-
 
 # measures a recording into a session folder, which it returns: `liex_lab.api.run_session`
 RunSession = Callable[..., Path]
@@ -150,7 +144,7 @@ class Crew:
         client: of their cluster.
     """
 
-    def __init__(self, client: Client, n_jobs: int = 0) -> None:
+    def __init__(self, client: Any, n_jobs: int = 0) -> None:
         """`n_jobs` workers are yet to connect; 0 if all are connected."""
         self.client, self._n_jobs = client, n_jobs
         self._report: Report = lambda *_: None

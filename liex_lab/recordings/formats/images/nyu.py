@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array, NDArray
+from liex_lab.arrays import Array, ArrayLike, NDArray
 from liex_lab.body.pose import Fit, Pose, fit_poses
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.errors import LiexError, RecordingError
