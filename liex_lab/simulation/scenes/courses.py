@@ -45,7 +45,7 @@ def read_courses(path: Path) -> Array:
 
     Raises:
         MissingPackageError: h5py is not installed.
-        LiexError: the file is none, or has no identities.
+        LiexError: the file is no such file, or has no identities.
     """
     try:
         import h5py
