@@ -158,11 +158,8 @@ class LabelledTrack(Rows):
 # Scores of recognised actions: frame-wise F1, segmental F1@50, confusion matrix.
 
 
-Words = NDArray[np.str_]
-
-
 def timeline_scores(
-    pairs: Iterable[tuple[LabelledTrack, Words]], words: Sequence[str]
+    pairs: Iterable[tuple[LabelledTrack, NDArray[np.str_]]], words: Sequence[str]
 ) -> dict[str, Any]:
     """Scores of recognised words against the labels of their tracks.
 

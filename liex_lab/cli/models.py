@@ -13,9 +13,7 @@ from liex_lab.cli.options import (
     AnimalName,
     JsonFile,
     NamesFile,
-    RowName,
     SessionPath,
-    VariantName,
     command_group,
     echo,
     print_numbers,
@@ -36,7 +34,13 @@ def train(
             help="fish, mouse, hand or a skeleton's .toml; or actions, tracking or shape.",
         ),
     ],
-    variant: VariantName = "default",
+    variant: Annotated[
+        str,
+        typer.Option(
+            "--variant",
+            help="default or paper; `liex evaluate tables --help` lists the differences.",
+        ),
+    ] = "default",
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="Model file, .npz (.skops for actions)."),
@@ -189,7 +193,12 @@ def evaluate_pose(
             "--split", help="clean, hard, other-body, other-camera, other-build or foreign."
         ),
     ] = "clean",
-    variant: RowName = "default",
+    variant: Annotated[
+        str,
+        typer.Option(
+            "--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn."
+        ),
+    ] = "default",
     model: OwnModel = None,
     n_frames: Annotated[
         int | None,

@@ -57,17 +57,6 @@ Settings = Annotated[
 AnimalName = Annotated[
     str, typer.Option("--animal", help="fish, mouse, hand, or a skeleton's .toml file.")
 ]
-VariantName = Annotated[
-    str,
-    typer.Option(
-        "--variant",
-        help="default or paper; `liex evaluate tables --help` lists the differences.",
-    ),
-]
-RowName = Annotated[
-    str,
-    typer.Option("--variant", help="default, paper, paper-one-pose, paper-no-metric, rf or cnn."),
-]
 JsonFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Also write the numbers to this file.")
 ]

@@ -22,7 +22,6 @@ from liex_lab.sessions import corrections, folder
 from ..arenas import run_arenas
 from .status import (
     INSPECTING,
-    InspectSession,
     MeasuringStage,
     SessionStatus,
     about,
@@ -173,7 +172,7 @@ class Crew:
     def inspect(
         self,
         sessions: Sequence[PlannedSession],
-        inspect: InspectSession,
+        inspect: Callable[[PlannedSession, Progress], dict[str, Any]],
         report: Report = lambda *_: None,
         finished: Finished = lambda _: None,
     ) -> list[dict[str, Any]]:

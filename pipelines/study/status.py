@@ -6,7 +6,7 @@ current. If sessions share the size and shape of their animal, each is inspected
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -40,7 +40,6 @@ from ..session import MEASURING
 from .shared_body import MOST_APART, Inspection, agree, spread_of
 
 INSPECTING = "inspecting the animal"
-InspectSession = Callable[[PlannedSession, Progress], dict[str, Any]]  # the content of look.json
 
 
 def what_changed(session: PlannedSession, document: dict[str, Any]) -> str:

@@ -71,8 +71,6 @@ _STATE_IT = (
     "camera.cx=... --set camera.cy=..."
 )
 
-_Numbers = tuple[float, float, float, float]
-
 
 @dataclass
 class _Topic:
@@ -569,7 +567,9 @@ def _is_straight(topic: _Topic) -> bool:
     return "rect" in topic.name.rpartition("/")[2] or is_cloud
 
 
-def _mapped(topic: _Topic, calibration: Calibration) -> tuple[_Numbers, tuple[int, int]]:
+def _mapped(
+    topic: _Topic, calibration: Calibration
+) -> tuple[tuple[float, float, float, float], tuple[int, int]]:
     """(fx, fy, cx, cy) and size, px, of the images on a topic, by binning and region of interest.
 
     A calibration describes the full image, of which the topic may show a part or every second
