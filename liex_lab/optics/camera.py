@@ -18,8 +18,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array, ArrayLike
+from liex_lab.arrays import Array
 from liex_lab.errors import LiexError
 
 BROWN_CONRADY = "brown_conrady"
@@ -366,6 +367,7 @@ class DepthMode(NamedTuple):
         mode: of its depth stream.
         camera: nominal intrinsics; a specimen differs by one or two per cent.
         range_mm: nearest and farthest distance, mm; None if not stated.
+        rates_hz: its frame rates, frames/s.
         unit_mm: mm of a step of its depth, as delivered.
     """
 
@@ -373,6 +375,7 @@ class DepthMode(NamedTuple):
     mode: str
     camera: Camera
     range_mm: tuple[float, float] | None
+    rates_hz: tuple[int, ...]
     unit_mm: float
 
 
@@ -384,7 +387,10 @@ def _depth_modes() -> tuple[DepthMode, ...]:
         size = int(row["width"]), int(row["height"])
         camera = Camera(fx, fy, cx, cy, *size, row["source"], distortion=_LENSES[row["lens"]])
         reach = (float(row["near_mm"]), float(row["far_mm"])) if row["far_mm"] else None
-        modes.append(DepthMode(row["name"], row["mode"], camera, reach, float(row["unit_mm"])))
+        rates = tuple(map(int, row["rates_hz"].split()))
+        modes.append(
+            DepthMode(row["name"], row["mode"], camera, reach, rates, float(row["unit_mm"]))
+        )
     return tuple(modes)
 
 
