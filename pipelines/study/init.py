@@ -6,7 +6,6 @@ listed once; files that one camera wrote one after the other are one session.
 """
 
 import hashlib
-import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +14,7 @@ from itertools import count
 from pathlib import Path
 
 from liex_lab.errors import RecordingError, StudyError, refuse
+from liex_lab.plan.plan import toml_value
 from liex_lab.plan.study import (
     CONTAINER,
     DERIVED,
@@ -293,20 +293,15 @@ def _text(root: Path, named: Sequence[Named], notes: Sequence[str]) -> str:
             [
                 _HEADER.format(file=STUDY_FILE, raw=RAW),
                 *(f"# note: {note}" for note in notes),
-                f"name = {_quoted(root.resolve().name or 'study')}",
+                f"name = {toml_value(root.resolve().name or 'study')}",
                 _SETTINGS,
             ]
         )
     ]
     for one in dict.fromkeys(animal for animal, *_ in named):
         origins = dict.fromkeys(o or "nothing, so check it" for a, _, _, o in named if a == one)
-        blocks.append(_ANIMAL.format(id=_quoted(one), origins=", ".join(origins)))
+        blocks.append(_ANIMAL.format(id=toml_value(one), origins=", ".join(origins)))
     for animal, session, path, _ in named:
-        texts = (_quoted(text) for text in (animal, session, path.relative_to(root).as_posix()))
+        texts = (toml_value(text) for text in (animal, session, path.relative_to(root).as_posix()))
         blocks.append(_SESSION.format(*texts))
     return "\n".join(blocks)
-
-
-def _quoted(text: str) -> str:
-    """A TOML string; JSON's escapes are TOML's, except for DEL."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
