@@ -26,7 +26,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 
 from liex_lab.arrays import Array, NDArray
@@ -47,7 +46,7 @@ from liex_lab.tracking.track import Subject, Track
 from liex_lab.tracking.tracker import FrameTracker
 
 from ..build import build_scene, plan_of
-from .pose_model import estimator_of
+from .pose_model import estimator_of, use_cores
 
 Knots = tuple[tuple[float, float], ...]
 
@@ -103,8 +102,7 @@ def train_tracking(
     Returns:
         `out`.
     """
-    if workers:
-        numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
+    use_cores(workers)
     measured = [
         measure(animal, kind, seed, n_frames, progress)
         for kind in ("easy", "hard")

@@ -141,6 +141,12 @@ def recipe_of(variant: str, skeleton: Skeleton) -> Recipe:
     return replace(_OWN["fish", variant], seed=Recipe.seed, sizes=sizes)
 
 
+def use_cores(workers: int) -> None:
+    """Run kernels on this many cores, at most those of the machine; 0 means all of them."""
+    if workers:
+        numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
+
+
 def train_model(
     animal: str,
     variant: str,
@@ -168,8 +174,7 @@ def train_model(
     Returns:
         The path of the model.
     """
-    if workers:
-        numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
+    use_cores(workers)
     skeleton = Skeleton.load(animal)
     recipe = recipe_of(variant, skeleton)
     if n_images is not None:

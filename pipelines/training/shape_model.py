@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from liex_lab.body.pose import Array, Pose
@@ -25,7 +24,7 @@ from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import HeightMaps, view_of
 from liex_lab.simulation import simulator, training_patches
 
-from .pose_model import estimator_of, extract, recipe_of
+from .pose_model import estimator_of, extract, recipe_of, use_cores
 
 PER_SESSION = 16
 _LEAST_GOOD = 8  # frames per mini-session
@@ -58,8 +57,7 @@ def train_shape(
     Raises:
         LiexError: the animal is not a chain with a tube as its body.
     """
-    if workers:
-        numba.set_num_threads(min(workers, numba.config.NUMBA_NUM_THREADS))
+    use_cores(workers)
     estimator = estimator_of(animal, "default", progress)
     known = n_sessions or 512
     rows = list(mini_sessions(estimator, "wide", known, progress))
