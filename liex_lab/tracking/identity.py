@@ -216,7 +216,8 @@ def own_observations(
     own.behind[touching, :2] = _covering(observed, touching, usual_px)[touching, None]
     # of an outline that a neighbour cuts, the metric does not know which end is the head
     touching &= own.known[:, 0] & own.known[:, 1]
-    own.score[touching, :2] = own.score[touching, :2].min(axis=1, keepdims=True)
+    for values in (own.score, own.error_mm):
+        values[touching, :2] = values[touching, :2].min(axis=1, keepdims=True)
     return own
 
 
