@@ -22,6 +22,7 @@ from liex_lab.tracking.track import DOUBTFUL
 
 from ..figures.animals import DepthImages, SessionAnimal
 from ..report.contact_sheet import png
+from ..report.report import contradicting
 from ..video.film import Footage
 from .tables import records
 
@@ -130,12 +131,10 @@ class Desk(Footage):
         for flip in records(flips[~flips["applied"].astype(bool)]):
             why = f"head and tail perhaps exchanged (p {float(flip['p_flip']):.2f})"
             found.append(_stretch(flip["start_s"], flip["stop_s"], "flip", why))
-        bouts = self.session.bouts
-        if "contradicts" in bouts:
-            for bout in records(bouts[bouts["contradicts"].fillna("").astype(str) != ""]):
-                word = str(bout["action"]).replace("_", " ")
-                why = f"{word} contradicts its definition: {bout['contradicts']}"
-                found.append(_stretch(bout["start_s"], bout["stop_s"], "action", why))
+        for bout in records(contradicting(self.session)):
+            word = str(bout["action"]).replace("_", " ")
+            why = f"{word} contradicts its definition: {bout['contradicts']}"
+            found.append(_stretch(bout["start_s"], bout["stop_s"], "action", why))
         return sorted(found, key=lambda one: float(one["start_s"]))
 
     @cached_property

@@ -25,7 +25,7 @@ from ..units import counted, day, page, paragraphs, reading, shown, titled
 from ..video.film import scale_mm
 from .contact_sheet import thumbnails, whole_image
 
-_TEMPLATES = Path(__file__).parent / "templates"
+TEMPLATES = Path(__file__).parent / "templates"
 
 
 def methods(session: Session) -> list[str]:
@@ -40,7 +40,7 @@ def methods(session: Session) -> list[str]:
     elif actions and not sources & {"model", "rule"}:
         sources.add("rule")
     return paragraphs(
-        _TEMPLATES / "methods.j2",
+        TEMPLATES / "methods.j2",
         about=about,
         counted=counted,
         kind=axis.kind,
@@ -85,7 +85,7 @@ def warnings(session: Session) -> list[str]:
         )
     noise = session.summary.iloc[0].get("speed_noise_mm_s", np.nan) if behaviour else np.nan
     return about["problems"] + paragraphs(
-        _TEMPLATES / "warnings.j2",
+        TEMPLATES / "warnings.j2",
         counted=counted,
         shown=shown,
         frames=frames,
@@ -106,7 +106,7 @@ def warnings(session: Session) -> list[str]:
         n_gaps=len(session.gaps),
         slow=slow,
         fps=fps,
-        n_contradicting=len(_contradicting(session)),
+        n_contradicting=len(contradicting(session)),
         lost_share=0.02,  # of the frames
         doubtful_share=0.05,  # of the frames
         error_share=0.1,  # of the length
@@ -169,10 +169,10 @@ def beside_average(shape: Mapping[str, Any]) -> str:
         shape: section `animal.shape` of session.json.
     """
     moved = [float(np.linalg.norm(joint)) for joint in shape.get("joints_moved", ())]
-    return " ".join(paragraphs(_TEMPLATES / "shape.j2", shape=shape, moved=moved))
+    return " ".join(paragraphs(TEMPLATES / "shape.j2", shape=shape, moved=moved))
 
 
-def _contradicting(session: Session) -> pd.DataFrame:
+def contradicting(session: Session) -> pd.DataFrame:
     """Bouts that a person named or a correction changed, and that contradict their definition."""
     bouts = session.bouts
     if "contradicts" not in bouts:
@@ -188,7 +188,7 @@ def refusal_rows(session: Session) -> list[tuple[str, str, str, str, str]]:
     """
     refused = (session.metadata.get("refused_bouts") or {}).get("bouts", [])
     rows = [(one, one["named"] or "unlabelled", one["why"]) for one in refused]
-    kept = _contradicting(session).to_dict("records")
+    kept = contradicting(session).to_dict("records")
     rows += [(one, f"left, by {one['source']}", one["contradicts"]) for one in kept]
     return [
         (f"{one['start_s']:.2f}", f"{one['stop_s']:.2f}", str(one["action"]), str(what), str(why))
@@ -217,9 +217,6 @@ def frame_account(session: Session) -> list[tuple[str, float, int, str]]:
     ]
     total = max(sum(count for _, count, _ in parts), 1)
     return [(what, count / total, int(count), kind) for what, count, kind in parts]
-
-
-TEMPLATES = Path(__file__).parent / "templates"
 
 
 _TABLES = (
