@@ -233,7 +233,13 @@ CALLS: list[tuple[str, str, Any, tuple[Any, ...], dict[str, Any], str]] = [
         "evaluation.several.evaluate_several",
         {"rows": {"all": {"idf1": 0.5, "interactions_true": {"macro_f1": 0.9, "f1": {}}}}},
         (3,),
-        {"n_frames": 300, "n_recordings": 6, "sealed": False},
+        {
+            "animal": "mouse",
+            "n_frames": 300,
+            "n_recordings": 6,
+            "sealed": False,
+            "courses": None,
+        },
         "| all | 0.5 | 0.9 |",
     ),
     (
