@@ -5,8 +5,8 @@ none. The ground is therefore read in sampled frames that show the whole animal,
 place that changes and on its way (`learning.learn_scene`). A reading is the median of five such
 frames. Consecutive ones that agree within 0.7 of the foreground's margin (7 mm), but for half an
 animal's area, are one stretch, whose ground is their median; between two stretches the ground is
-the farther one of both, as it is not known when it changed. A frame is brought to the farthest ground of all: a reading z of the
-ground g, no nearer than the foreground's margin,
+the farther one of both, as it is not known when it changed. A frame is brought to the farthest
+ground of all: a reading z of the ground g, no nearer than the foreground's margin,
 
     z >= g - margin    becomes    z + max(g) - g,
 
