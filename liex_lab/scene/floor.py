@@ -18,15 +18,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, Mask, NDArray
 from liex_lab.errors import EstimationError
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 
-Array = NDArray[np.float64]
 Depths = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 # pixels that vote for a plane, and planes tried
 _N_VOTERS = 6000

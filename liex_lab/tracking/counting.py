@@ -12,17 +12,15 @@ stand free.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from liex_lab.arrays import Mask, NDArray
 from liex_lab.body.skeleton import VIEWS
 from liex_lab.runtime.memory import in_windows
 from liex_lab.scene.height_maps import ANIMAL_HEIGHTS, N_OBJECTS
 from liex_lab.tracking.observations import Array, Observations, Small
 from liex_lab.tracking.track import spans
-
-Mask = NDArray[np.bool_]
 
 # in roots of the animal's area, about half the length of its outline
 _MOVES = 0.5

@@ -25,8 +25,8 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Mask, NDArray
 from liex_lab.recordings.timestamps import GAP_FACTOR, median_step
 from liex_lab.runtime.memory import Allocator, blocks
 from liex_lab.tracking.association import NONE, HypothesisAssociation
@@ -58,8 +58,6 @@ from liex_lab.tracking.trust import (
     usual_pixels,
     write_curve,
 )
-
-Mask = NDArray[np.bool_]
 
 
 def polled_twice(times_ns: NDArray[np.int64], copies: Mask, known: Mask) -> Mask:

@@ -23,8 +23,8 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Mask, NDArray
 from liex_lab.body.skeleton import VIEWS
 from liex_lab.errors import EstimationError
 from liex_lab.estimation.estimator import PoseEstimator
@@ -38,7 +38,6 @@ from liex_lab.tracking.observations import Array, Observations
 from liex_lab.tracking.residual import render_crops
 from liex_lab.tracking.tracker import FrameTracker
 
-Mask = NDArray[np.bool_]
 Labels = NDArray[np.int8]  # of pixels: the animal's number, -1 for none
 
 _SAME_SIZE = 0.1  # largest difference of the logarithms of the sizes of animals of one size

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body._skinning_kernels import place_joints
 from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
@@ -20,7 +20,6 @@ from liex_lab.geometry import SE3, so3
 from liex_lab.runtime.memory import Allocator, Rows, blocks
 from liex_lab.scene.height_maps import N_OBJECTS
 
-Array = NDArray[np.float64]
 Small = NDArray[np.float32]
 
 

@@ -13,14 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.errors import LiexError, one_line, refuse
 from liex_lab.plan.sections import Rfid
 from liex_lab.runtime.text_files import number, read_texts
 from liex_lab.scene.scene import Arena
 
-Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _COLUMNS = ("time_s", "antenna", "id")

@@ -12,15 +12,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Array, NDArray
 from liex_lab.body.pose import Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime.memory import Allocator, Rows, blocks, in_windows
-
-Array = NDArray[np.float64]
 
 _BLOCK = 16_384  # frames in memory at once
 # flags of measured poses that are not trusted: off, or not clearly this animal's
