@@ -562,7 +562,14 @@ def build_scene(
         )
     sizes = (animal.spine_min_mm, animal.spine_max_mm)
     return learning.learn_scene(
-        recording, sizes, n_frames, foreground.min_height_mm, skeleton.view, floor, region
+        recording,
+        sizes,
+        n_frames,
+        foreground.min_height_mm,
+        skeleton.view,
+        floor,
+        region,
+        alone=animal.count in (1, "auto"),
     )
 
 

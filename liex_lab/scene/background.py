@@ -350,61 +350,6 @@ class SceneChange:
         )
 
 
-@dataclass(frozen=True)
-class RaisedGround:
-    """Ground that rose or sank slowly: a nest that was built, or bedding that was moved.
-
-    Attributes:
-        rise_mm: median rise of its largest part from the first to the last third, mm; negative if
-            it sank.
-        area_mm2: of all its parts, mm^2.
-    """
-
-    rise_mm: float
-    area_mm2: float
-
-    @staticmethod
-    def find(
-        sample: NDArray[np.float32], on_floor: Mask, camera: Camera, least: tuple[float, float]
-    ) -> RaisedGround | None:
-        """Find it in frames spread over a recording.
-
-        The ground of a third is its farthest mode, so that an animal that often rests in one place
-        is no ground.
-
-        Args:
-            sample: (n, H, W) float32 mm, the frames, 0 where unread.
-            on_floor: (H, W) bool, the visible floor.
-            camera: of those pixels.
-            least: smallest height, mm, and smallest area of a part, mm^2.
-
-        Returns:
-            The ground; None if it does not change, or fewer than 24 frames are given.
-        """
-        thirds = np.array_split(sample, 3)
-        if len(thirds[-1]) < 8:
-            return None
-        before, after = (learn_background(thirds[k])[0] for k in (0, 2))
-        rise = np.where(on_floor & (before > 0) & (after > 0), before - after, np.float32(0))
-        px_mm2 = before.astype(float) ** 2 / (camera.fx * camera.fy)
-        found = [
-            (float(px_mm2[part].sum()), float(np.median(rise[part])))
-            for part in (*parts(rise > least[0]), *parts(rise < -least[0]))
-        ]
-        found = [one for one in found if one[0] > least[1]]
-        return RaisedGround(max(found)[1], sum(one[0] for one in found)) if found else None
-
-    @property
-    def sentence(self) -> str:
-        """The change in words."""
-        return (
-            f"{0.01 * self.area_mm2:.0f} cm² of the floor, such as a nest or bedding, "
-            f"{'rose' if self.rise_mm > 0 else 'sank'} by {abs(self.rise_mm):.0f} mm during the "
-            "recording, and what rises is measured as a part of the animal there: measure the "
-            "recording in shorter parts, such as its files"
-        )
-
-
 def _usual(depths: NDArray[np.float32]) -> NDArray[np.float32]:
     """The median (P,) of the readings in frames (n, P), mm; 0 where most are unread."""
     return np.where(2 * (depths > 0).sum(axis=0) >= len(depths), usual_depth(depths), np.float32(0))

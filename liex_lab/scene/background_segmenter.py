@@ -26,11 +26,8 @@ from liex_lab.runtime.memory import check_shapes
 from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene import _height_map_kernels as kernels
 from liex_lab.scene._blob_kernels import MAX_BLOBS
-from liex_lab.scene.background import (
-    FloorLevel,
-    RaisedGround,
-    SceneChange,
-)
+from liex_lab.scene.background import FloorLevel, SceneChange
+from liex_lab.scene.changing_ground import ChangingGround, RaisedGround
 from liex_lab.scene.floor import Array, Depths, Floor, Mask
 from liex_lab.scene.height_maps import (
     N_OBJECTS,
@@ -64,7 +61,9 @@ class BackgroundSubtraction(Segmenter):
         support_plane: how the floor was found; None if it was given.
         worn: how worn devices are separated from the animal, in the order of their removal.
         level: reference level of the floor; None if it does not drift.
-        changed: a lasting change of the scene; None without one.
+        changed: a lasting change of the scene that may make measurements wrong; None without one.
+        ground: where the ground changes, to which frames are brought with `levelled` before
+            `extract`; None if it does not.
         sensor: quality of its readings; None without a sample.
         transient_objects: objects that stand on the floor for a part of the recording.
         n_animals: how many animals are in view at once in the sampled frames.
@@ -83,7 +82,8 @@ class BackgroundSubtraction(Segmenter):
     support_plane: SupportPlane | None = None
     level: FloorLevel | None = None
     worn: tuple[Worn, ...] = ()
-    changed: SceneChange | RaisedGround | None = None
+    changed: SceneChange | RaisedGround | ChangingGround | None = None
+    ground: ChangingGround | None = None
     sensor: SensorCard | None = None
     transient_objects: tuple[Fixture, ...] = ()
     n_animals: int = 1
@@ -115,6 +115,7 @@ class BackgroundSubtraction(Segmenter):
             wander_mm=None if self.level is None else self.level.wander_mm,
             thin_above=any(isinstance(device, Cable) for device in self.worn),
             sensor=self.sensor,
+            ground_changes_s=() if self.ground is None else self.ground.changes_s,
         )
         found = self.support_plane
         if found is None:
@@ -229,12 +230,19 @@ class BackgroundSubtraction(Segmenter):
                 "that warms up, and was corrected to its initial value",
             )
         )
-        return (*(device.remark for device in self.worn), *drift)
+        followed = () if self.ground is None or self.changed else (self.ground.sentence,)
+        return (*(device.remark for device in self.worn), *drift, *followed)
 
     @property
     def doubts(self) -> tuple[str, ...]:
         """Whether the camera was displaced, or the scene or its ground changed."""
         return () if self.changed is None else (self.changed.sentence,)
+
+    def levelled(self, depths: Depths, times_ns: NDArray[np.int64]) -> Depths:
+        """See `Segmenter`; without a ground that changes, the same images."""
+        if self.ground is None:
+            return depths
+        return self.ground.levelled(depths[:, :: self.stride, :: self.stride], times_ns)
 
     def cleared(self, depths: Depths) -> Depths:
         """Full images without worn cables, 0 there.

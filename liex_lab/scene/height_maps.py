@@ -431,6 +431,20 @@ class Segmenter(ABC):
         n = len(depths)
         return crops[:n], crops[n:]
 
+    def levelled(
+        self, depths: NDArray[np.float32], times_ns: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Images for `extract`, with a ground that changes at one depth.
+
+        Args:
+            depths: (n, H, W) float32 mm, full images, 0 where unread.
+            times_ns: (n,) of the images.
+
+        Returns:
+            (n, H, W) float32 mm, full images or at the scene's stride.
+        """
+        return depths
+
     def cleared(self, depths: NDArray[np.float32]) -> NDArray[np.float32]:
         """Images without worn devices, 0 there; unchanged if there are none.
 

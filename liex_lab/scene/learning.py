@@ -16,6 +16,7 @@ other times.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -30,13 +31,13 @@ from liex_lab.recordings.recording import Recording
 from liex_lab.scene.background import (
     BareGround,
     FloorLevel,
-    RaisedGround,
     SceneChange,
     sample_frames,
     sampled,
     stride_for,
 )
 from liex_lab.scene.background_segmenter import BackgroundSubtraction as Scene
+from liex_lab.scene.changing_ground import ChangingGround, RaisedGround
 from liex_lab.scene.floor import Array, Depths, Floor, Mask, parts
 from liex_lab.scene.height_maps import ANIMAL_HEIGHTS
 from liex_lab.scene.scene import HIGH_MM, LEAST_MM2, Fixture, fixture_at
@@ -410,6 +411,7 @@ def learn_scene(
     view: CameraView = MOUSE_VIEW,
     floor: Floor | None = None,
     region: Mask | None = None,
+    alone: bool = True,
 ) -> tuple[Scene, Depths]:
     """Learn the background subtraction of a recording from frames spread over it.
 
@@ -420,6 +422,9 @@ def learn_scene(
     animal, it may be absorbed into its own background: the floor plane is then tried as
     background, and kept if more frames show an animal.
 
+    If the ground changes and sampled frames show it without the animal, the rest is learned from
+    frames on level ground, see `changing_ground`.
+
     Args:
         recording: of an ideal pinhole camera, see `recordings.rectify`.
         spine_mm: lengths of the smallest and the largest expected animal, mm.
@@ -428,6 +433,7 @@ def learn_scene(
         view: how such animals are viewed; one that does not stand on the floor may be anywhere.
         floor: the stated floor; None to estimate it.
         region: (height, width) bool of the full image, analysed pixels; None for all.
+        alone: whether there is one animal, so that the rest of a frame shows the ground.
 
     Returns:
         The segmenter, and the sample (n, H, W) float32 mm of frames that it was learned from,
@@ -440,32 +446,113 @@ def learn_scene(
     target = TargetAnimal(spine_mm, min_height_mm, view)
     stride = stride_for(recording, spine_mm[0])
     sample = sample_frames(recording, n_frames, stride)
-    cut = None
-    if region is not None:
-        cut = region[::stride, ::stride]
-        sample *= cut
-    camera = recording.camera
-    ground, level = BareGround.steady(sample, camera.every(stride), target, floor, cut)
+    cut = None if region is None else region[::stride, ::stride]
+    sample *= True if cut is None else cut
     times_ns = recording.times_ns[sampled(len(recording), n_frames)]
     times_s = (times_ns - recording.times_ns[0]) * 1e-9
+    known = recording.camera, stride, target, floor, cut, times_s
+    scene, first, raised = _learned(sample, *known)
+    ground = _changing_ground(recording, scene, first, target) if raised and alone else None
+    if ground is not None:
+        with suppress(EstimationError):
+            even, level, left = _learned(ground.levelled(sample, times_ns), *known)
+            if not (left or even.changed) and even.n_animals == 1 and ground.changes_s:
+                return replace(
+                    even,
+                    ground=ground,
+                    # of the time
+                    changed=ground if ground.unknown_share > 0.05 else None,
+                    transient_objects=scene.transient_objects,
+                ), level
+    return scene, first
+
+
+def _learned(
+    sample: Depths,
+    camera: Camera,
+    stride: int,
+    target: TargetAnimal,
+    floor: Floor | None,
+    cut: Mask | None,
+    times_s: Array,
+) -> tuple[Scene, Depths, RaisedGround | None]:
+    """The scene of a sample, the sample as corrected, and its ground that changed, see
+    `learn_scene`.
+    """
+    ground, level = BareGround.steady(sample, camera.every(stride), target, floor, cut)
     scene, sample = _scene_of(camera, stride, ground, level)
     if target.stands_on_floor and floor is None and not ground.support_plane.moves:
         # without movers, the animal at rest decides which of two levels is the floor
         under = ground.under(scene.animal_masks(scene.extract(sample, 1.0)))
         if under.support_plane is not ground.support_plane:
             scene, sample = _scene_of(camera, stride, under, level)
-    changed = SceneChange.find(sample, times_s, scene.grid, scene.area_mm2)
+    changed: SceneChange | RaisedGround | None = SceneChange.find(
+        sample, times_s, scene.grid, scene.area_mm2
+    )
     scene = replace(scene, volume_mm3=scene.usual_volume(sample), changed=changed)
     n_animals, share = count_in_sample(scene, sample)
-    scene = replace(scene, n_animals=n_animals, n_animals_share=share)
-    scene = replace(scene, sensor=read_sensor(scene, sample))
-    if target.stands_on_floor and changed is None:
-        objects = find_transient_objects(scene, sample, times_s)
-        # an animal asleep, or several side by side, are no ground
-        least = (target.min_height_mm, 1.5 * max(n_animals, 1) * scene.area_mm2)
-        raised = None if objects else RaisedGround.find(sample, scene.on_floor, scene.grid, least)
-        scene = replace(scene, transient_objects=objects, changed=raised)
-    return scene, sample
+    scene = replace(
+        scene, n_animals=n_animals, n_animals_share=share, sensor=read_sensor(scene, sample)
+    )
+    if not target.stands_on_floor:
+        return scene, sample, None
+    objects = () if changed else find_transient_objects(scene, sample, times_s)
+    # an animal asleep is no ground; a nest may have been taken for it, but does not move
+    moving_mm2 = float(np.fmin(scene.area_mm2, ground.support_plane.mover_mm2))
+    raised = RaisedGround.find(
+        sample, scene.on_floor, scene.grid, (target.min_height_mm, 1.5 * moving_mm2)
+    )
+    # and neither are several side by side
+    if (
+        raised is not None
+        and not (changed or objects)
+        and raised.part_mm2 > 1.5 * max(n_animals, 1) * scene.area_mm2
+    ):
+        changed = raised
+    return replace(scene, transient_objects=objects, changed=changed), sample, raised
+
+
+def _changing_ground(
+    recording: Recording, scene: Scene, sample: Depths, target: TargetAnimal
+) -> ChangingGround | None:
+    """The ground of a recording in stretches; None if too few frames show it.
+
+    Args:
+        recording: to read four times as many frames from.
+        scene: learned from the sample.
+        sample: (n, H, W) float32 mm, frames at its stride.
+        target: the expected animal.
+    """
+    where = ChangingGround.places(sample, scene.on_floor, target.min_height_mm)
+    near = cv2.dilate(where.astype(np.uint8), np.ones((9, 9))) > 0
+    area, _ = scene.usual_area(np.where(where, np.float32(0), sample), target.spine_mm)
+    own = replace(scene, area_mm2=area)
+    chosen = sampled(len(recording), 4 * len(sample))
+    readings = np.empty((len(chosen), np.count_nonzero(where)), np.float32)
+    places = np.full((len(chosen), 2), np.nan)
+    for k, index in enumerate(chosen):
+        depth = recording.frame(int(index)).depth[None, :: scene.stride, :: scene.stride]
+        depth = depth if scene.level is None else scene.level.brought_back(depth)
+        readings[k] = depth[0, where]
+        crops = own.extract(np.where(where, np.float32(0), depth), 1.0)
+        if area / 1.5 < crops.blobs.area_mm2[0] < 1.5 * area:
+            is_beside = (own.animal_masks(crops)[0] & near).any()
+            places[k] = np.nan if is_beside else crops.centroid[0, :2]
+    # what stands still from frame to frame, or for two seconds, may be an object
+    step = 1 + int(2e9 / np.diff(recording.times_ns[chosen]).mean())
+    moved = np.linalg.norm(places[step:] - places[:-step], axis=1) > 0.5 * np.sqrt(area)
+    shows = np.append(moved, [False] * step) | np.append([False] * step, moved)
+    if shows.sum() < _LEAST_FRAMES:
+        return None
+    return ChangingGround.follow(
+        where,
+        (scene.background - scene.limit)[where],
+        readings,
+        shows,
+        recording.times_ns[chosen],
+        0.5 * area * scene.grid.fx * scene.grid.fy / scene.floor.distance_mm**2,
+        scene.level,
+    )
 
 
 def _scene_of(

@@ -414,6 +414,8 @@ class Scene:
         thin_above: whether something thin above the animal, a cable or bars, is removed from the
             images.
         sensor: quality of the sensor's readings; None if unknown.
+        ground_changes_s: times, s since the first frame, from which the background is another one,
+            as under a nest; empty if the ground does not change.
     """
 
     floor: Floor
@@ -430,6 +432,7 @@ class Scene:
     wander_mm: float | None = None
     thin_above: bool = False
     sensor: SensorCard | None = None
+    ground_changes_s: tuple[float, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers for session.json, without the outline, which is stored as `arena`."""
@@ -451,6 +454,11 @@ class Scene:
             "fixtures": [fixture.to_dict() for fixture in self.fixtures],
             "doubts": list(self.doubts),
             **({} if self.sensor is None else {"sensor": self.sensor.to_dict()}),
+            **(
+                {"ground_changes_s": [round(at, 2) for at in self.ground_changes_s]}
+                if self.ground_changes_s
+                else {}
+            ),
         }
 
 

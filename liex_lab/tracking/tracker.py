@@ -203,7 +203,9 @@ class FrameTracker:
         observed.repeats[:] = [frame.repeats for frame in frames]
         # kernels distribute frames over cores: with one frame the others would idle
         with threads(len(frames) > 1):
-            hypotheses = self.estimator.hypotheses(depths, self.scene, self.size)
+            hypotheses = self.estimator.hypotheses(
+                self.scene.levelled(depths, times), self.scene, self.size
+            )
             observed.objects[:] = hypotheses[0].crops.objects
             poses = [self.put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
             self.put_agreement(observed, hypotheses, poses, self.scene.cleared(depths))

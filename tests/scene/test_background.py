@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from liex_lab.optics.camera import Camera
-from liex_lab.scene.background import FloorLevel, RaisedGround, SceneChange, wandering
+from liex_lab.scene.background import FloorLevel, SceneChange, wandering
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
+from liex_lab.scene.changing_ground import RaisedGround
 from liex_lab.scene.learning import learn_scene
 from tests.scene.staged import altered, walked
 
