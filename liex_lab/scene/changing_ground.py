@@ -3,8 +3,8 @@
 A lasting rise is ground only if it stays while the animal is elsewhere, so that an animal asleep is
 none. The ground is therefore read in sampled frames that show the whole animal, away from every
 place that changes and on its way (`learning.learn_scene`). A reading is the median of five such
-frames. Consecutive ones that agree within 5 mm, but for half an animal's area, are one stretch,
-whose ground is their median; between two stretches the ground is the farther one of both, as it
+frames. Consecutive ones that agree within 0.7 of the foreground's margin (7 mm), but for half an
+animal's area, are one stretch, whose ground is their median; between two stretches the ground is the farther one of both, as it
 is not known when it changed. A frame is brought to the farthest ground of all: a reading z of the
 ground g, no nearer than the foreground's margin,
 
@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 from liex_lab.optics.camera import Camera
 from liex_lab.scene.background import FloorLevel, learn_background, usual_depth
 from liex_lab.scene.floor import Depths, Mask, parts
-
-_ALIKE_MM = 5.0  # difference of readings of one ground
 
 
 @dataclass(frozen=True)
@@ -149,12 +147,13 @@ class ChangingGround:
                 not drift.
         """
         rows = np.flatnonzero(shows)
-        middle = np.clip(np.arange(len(rows)), 2, len(rows) - 3)
-        grounds = usual_depth(readings[rows[middle + np.arange(-2, 3)[:, None]]])
+        grounds = usual_depth(
+            readings[rows[np.clip(np.arange(len(rows)), 2, len(rows) - 3) + np.c_[-2:3]]]
+        )
         grounds = np.where(grounds > 0, grounds, grounds.max(axis=0))
         first = [0]
         for k, ground in enumerate(grounds):
-            if (np.abs(ground - grounds[first[-1]]) > _ALIKE_MM).sum() > least_px:
+            if (np.abs(ground - grounds[first[-1]]) > 0.7 * margin_mm).sum() > least_px:
                 first.append(k)
         own = [usual_depth(some) for some in np.split(grounds, first[1:])]
         # before and after, the ground is no nearer than what recurs there
@@ -164,16 +163,15 @@ class ChangingGround:
         )
         known = np.array([np.maximum(before, own[0]), *own, np.maximum(after, own[-1])])
         changes = (np.abs(np.diff(known, axis=0)) > margin_mm).sum(axis=1) > least_px
-        since_ns = times_ns[
-            [0, *rows[np.ravel([first, np.append(first[1:], len(rows)) - 1], order="F")]]
-        ]
-        share = np.diff(since_ns, append=times_ns[-1])[::2] / (times_ns[-1] - times_ns[0])
+        last = [*(k - 1 for k in first[1:]), len(rows) - 1]
+        since_ns = times_ns[[0, *rows[np.ravel([first, last], order="F")]]]
+        lasts_ns = np.diff(since_ns, append=times_ns[-1])[::2]
         return ChangingGround(
             where,
             margin_mm,
             np.insert(np.maximum(known[1:], known[:-1]), range(1, len(own) + 1), own, axis=0),
             since_ns,
-            float(share[changes].sum()),
+            float(lasts_ns[changes].sum() / (times_ns[-1] - times_ns[0])),
             level,
         )
 
@@ -213,5 +211,5 @@ class ChangingGround:
             0,
         )
         out = depths.copy()
-        out[:, self.where] = readings + lower
+        out[:, self.where] += lower
         return out

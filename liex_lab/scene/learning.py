@@ -453,10 +453,10 @@ def learn_scene(
     known = recording.camera, stride, target, floor, cut, times_s
     scene, first, raised = _learned(sample, *known)
     ground = _changing_ground(recording, scene, first, target) if raised and alone else None
-    if ground is not None:
+    if ground is not None and ground.changes_s and ground.unknown_share < 0.5:
         with suppress(EstimationError):
             even, level, left = _learned(ground.levelled(sample, times_ns), *known)
-            if not (left or even.changed) and even.n_animals == 1 and ground.changes_s:
+            if not (left or even.changed) and even.n_animals == 1:
                 return replace(
                     even,
                     ground=ground,
