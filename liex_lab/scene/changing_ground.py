@@ -4,9 +4,9 @@ A lasting rise is ground only if it stays while the animal is elsewhere, so that
 none. The ground is therefore read in sampled frames that show the whole animal, away from every
 place that changes and on its way (`learning.learn_scene`). A reading is the median of five such
 frames. Consecutive ones that agree within 0.7 of the foreground's margin (7 mm), but for half an
-animal's area, are one stretch, whose ground is their median; between two stretches the ground is the farther one of both, as it
-is not known when it changed. A frame is brought to the farthest ground of all: a reading z of the
-ground g, no nearer than the foreground's margin,
+animal's area, are one stretch, whose ground is their median; between two stretches the ground is
+the farther one of both, as it is not known when it changed. A frame is brought to the farthest
+ground of all: a reading z of the ground g, no nearer than the foreground's margin,
 
     z >= g - margin    becomes    z + max(g) - g,
 
@@ -187,9 +187,13 @@ class ChangingGround:
             "the floor, such as a nest or bedding, changed by up to "
             f"{np.percentile(np.ptp(self.depth_mm, axis=0), 90):.0f} mm, and the background "
             f"followed it in {len(self.changes_s) + 1} stretches, the later ones from "
-            f"{', '.join(f'{at:.0f}' for at in self.changes_s)} s on; in {self.unknown_share:.0%} "
-            "of the time it is unknown, as the animal was never elsewhere, and what rises is "
-            "measured as a part of the animal there"
+            f"{', '.join(f'{at:.0f}' for at in self.changes_s)} s on"
+            + (
+                f"; in {self.unknown_share:.0%} of the time it is unknown, as the animal was never "
+                "elsewhere, and what rises is measured as a part of the animal there"
+                if self.unknown_share > 0.0
+                else ""
+            )
         )
 
     def levelled(self, depths: Depths, times_ns: NDArray[np.int64]) -> Depths:
