@@ -187,9 +187,13 @@ class ChangingGround:
             "the floor, such as a nest or bedding, changed by up to "
             f"{np.percentile(np.ptp(self.depth_mm, axis=0), 90):.0f} mm, and the background "
             f"followed it in {len(self.changes_s) + 1} stretches, the later ones from "
-            f"{', '.join(f'{at:.0f}' for at in self.changes_s)} s on; in {self.unknown_share:.0%} "
-            "of the time it is unknown, as the animal was never elsewhere, and what rises is "
-            "measured as a part of the animal there"
+            f"{', '.join(f'{at:.0f}' for at in self.changes_s)} s on"
+            + (
+                f"; in {self.unknown_share:.0%} of the time it is unknown, as the animal was never "
+                "elsewhere, and what rises is measured as a part of the animal there"
+                if self.unknown_share > 0.0
+                else ""
+            )
         )
 
     def levelled(self, depths: Depths, times_ns: NDArray[np.int64]) -> Depths:
