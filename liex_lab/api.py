@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from liex_lab.pipelines.drawing import draw_figures, export_video
     from liex_lab.pipelines.evaluation.actions import evaluate_actions
     from liex_lab.pipelines.evaluation.paper.run import run_tables
-    from liex_lab.pipelines.evaluation.scale import run_scale, write_long
+    from liex_lab.pipelines.evaluation.scale import run_scale
     from liex_lab.pipelines.evaluation.scenes import evaluate_scenes
     from liex_lab.pipelines.evaluation.several import evaluate_several
     from liex_lab.pipelines.evaluation.tracking import evaluate_tracking
@@ -45,7 +45,6 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "serve_dashboard": "bench",
     "sync_session": "sync",
     "verify_session": "verify",
-    "write_long": "evaluation.scale",
     "run_scale": "evaluation.scale",
     "evaluate_tracking": "evaluation.tracking",
     "evaluate_scenes": "evaluation.scenes",
@@ -62,7 +61,6 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "evaluate_speed": "evaluation.speed",
     "evaluate_recordings": "evaluation.speed",
     "evaluate_live": "evaluation.live",
-    "evaluate_report": "evaluation.scale",
     "evaluate_statistics": "evaluation.statistics",
     "evaluate_sync": "evaluation.sync",
     "evaluate_cameras": "evaluation.cameras",
@@ -103,7 +101,6 @@ __all__ = [  # noqa: RUF022 - in the order of the manual
     "run_study",
     "serve_dashboard",
     "verify_session",
-    "write_long",
     "run_scale",
     "evaluate_tracking",
     "evaluate_scenes",

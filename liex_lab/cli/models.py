@@ -645,19 +645,6 @@ def evaluate_sync(
     return api.evaluate_sync(n_pairs, progress=progress)
 
 
-@benchmark("report")
-def evaluate_report(
-    session: SessionPath,
-    minutes: Annotated[
-        float, typer.Option("--minutes", min=1.0, help="Length of the long session, minutes.")
-    ] = 60.0,
-    *,
-    progress: Progress,
-) -> Result:
-    """Measure time and memory of a long session's report; SESSION is repeated to that length."""
-    return api.evaluate_report(session, minutes, progress=progress)
-
-
 @benchmark("nyu", lambda result: print_numbers(api.hands_in_short(result)))
 def evaluate_nyu(
     reference: Annotated[
@@ -725,18 +712,11 @@ def evaluate_scale(
     n_frames: Annotated[
         int, typer.Option("--frames", min=2000, help="Number of frames of each virtual recording.")
     ] = 3000,
-    minutes: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--minutes", min=0.1, help="Length of a recording whose memory is measured; repeatable."
-        ),
-    ] = None,
     *,
     progress: Progress,
 ) -> Result:
     """Measure the cost of a study: sessions per hour, memory, and time by step.
 
-    Takes about eleven minutes on two cores, and needs a machine without other work; with --minutes
-    10 alone, half of that.
+    Takes some minutes on two cores, and needs a machine without other work.
     """
-    return api.run_scale(n_frames, minutes or (10.0, 60.0, 180.0), progress=progress)
+    return api.run_scale(n_frames, progress=progress)
