@@ -419,7 +419,7 @@ class SessionWriter:
         document = durable.storable_document(self._document)
         text = json.dumps(document, indent=2, default=str, allow_nan=False)
         (self._folder / "session.json").write_text(text + "\n", encoding="utf-8")
-        del rows, of_track
+        del rows, of_track, own
         self._rows = None  # the report reads the folder
         memory.release_memory()
         self._publish_with_report()
