@@ -22,6 +22,7 @@ from liex_lab.behaviour.bouts import MouseRules, tidy
 from liex_lab.behaviour.days import Light
 from liex_lab.behaviour.kinematics import segments
 from liex_lab.behaviour.statistics import false_discovery
+from liex_lab.recordings.timestamps import GAP_FACTOR
 from liex_lab.runtime.memory import blocks
 from liex_lab.scene.scene import UNKNOWN, Arena
 from liex_lab.scene.zones import SEPARATOR
@@ -316,9 +317,9 @@ def around_onsets(
     span = time_s[after] - time_s[after - 1]
     share = np.divide(wanted - time_s[after - 1], span, out=np.zeros_like(wanted), where=span > 0)
     found = values[after - 1] + share * (values[after] - values[after - 1])
-    number = segments(time_s, np.isfinite(values))
-    inside = (number[after] == number[after - 1]) & (wanted >= time_s[0]) & (wanted <= time_s[-1])
-    found = np.where(inside, found, np.nan)
+    usual_s = float(np.median(np.diff(time_s)))
+    inside = (span <= GAP_FACTOR * usual_s) & (wanted >= time_s[0])
+    found = np.where(inside & (wanted <= time_s[-1]), found, np.nan)
     enough = np.isfinite(found).sum(axis=0) >= _FEWEST
     quartiles = np.full((3, _STEPS), np.nan)
     quartiles[:, enough] = np.nanpercentile(found[:, enough], [25.0, 50.0, 75.0], axis=0)
