@@ -31,7 +31,7 @@ from liex_lab.recordings.timestamps import unwritable_times
 from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, reporting_compilation, silent
 from liex_lab.scene.zones import masks_apart
-from liex_lab.tracking.identity import identify, own_observations
+from liex_lab.tracking.identity import covers, identify, own_observations
 from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.observations import Observations
 from liex_lab.tracking.rfid import Readings, read_readings
@@ -299,11 +299,13 @@ def _measure_animals(
         whole = [writer.observations(Observations) for writer in writers]
         subjects = [prepared.fitted.tracker.subject for prepared in going.values()]
         identity = identify(whole, subjects, readings)
+        alone = [own_observations(one, identity.slots[:, k]) for k, one in enumerate(whole)]
+        covering = covers(alone, subjects[0].length_mm)
         for k, (prepared, writer) in enumerate(zip(going.values(), writers, strict=True)):
             if readings is not None:
                 prepared.mark(writer, identity, k)
             crossings = [one for one in identity.crossings if k in one.animals]
-            prepared.follow(writer, own_observations(whole[k], identity.slots[:, k]), crossings)
+            prepared.follow(writer, alone[k], crossings, covering[k])
         for writer in writers:
             writer.others = [one.track.centroid_mm for one in writers if one is not writer]
         together = None

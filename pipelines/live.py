@@ -197,10 +197,12 @@ def track_live(
         for k, arrival in enumerate(some):
             history.append(identities.add([one[k : k + 1] for one in found]))
             rows = [one.add(own) for one, own in zip(online, history[-1], strict=True)]
-            for part in (*rows, *(one.recent[-1:] for one in online)):
+            unclear = identities.covering | (identities.p_swap > identity.UNCLEAR)
+            for part, whose in zip(
+                (*rows, *(one.recent[-1:] for one in online)), (*unclear, *unclear), strict=True
+            ):
                 assert part is not None  # without a lag
-                unclear = (part.flag == "") & (identities.p_swap > identity.UNCLEAR)
-                part.flag[unclear] = "unclear"
+                part.flag[(part.flag == "") & whose] = "unclear"
             if watch is not None:
                 watch.add(arrival, [one.recent for one in online])
             if view is not None:

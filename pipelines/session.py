@@ -499,6 +499,7 @@ class Prepared:
         writer: SessionWriter,
         observed: observations.Observations | None = None,
         crossings: Sequence[Crossing] | None = None,
+        covering: NDArray[np.bool_] | None = None,
     ) -> None:
         """Make the track of the animal and the verdict on it, and pass them to the writer.
 
@@ -506,9 +507,10 @@ class Prepared:
             writer: has all frames.
             observed: the observations of this animal; None uses those that the writer has.
             crossings: in which it may have been exchanged with another one; None if it is alone.
+            covering: (n,) where it may lie over another one.
         """
         began = time.perf_counter()
-        verdict = make_track(writer, self.fitted, observed, crossings)
+        verdict = make_track(writer, self.fitted, observed, crossings, covering)
         self.timings["track"] += time.perf_counter() - began
         writer.note(problems=self.recording.problems, verdict=verdict.to_dict())
 
@@ -597,6 +599,7 @@ def make_track(
     fitted: Fitted,
     observed: observations.Observations | None = None,
     crossings: Sequence[Crossing] | None = None,
+    covering: NDArray[np.bool_] | None = None,
 ) -> Verdict:
     """Make the track of a session whose frames have all been measured, and pass it to the writer.
 
@@ -605,6 +608,7 @@ def make_track(
         fitted: plan, recording and tracker.
         observed: the observations of the animal; None uses those that the writer has.
         crossings: in which it may have been exchanged with another one; None if it is alone.
+        covering: (n,) where it may lie over another one.
 
     Returns:
         The verdict on the session.
@@ -614,7 +618,7 @@ def make_track(
     tracked = tracker.track(whole, allocate=writer.allocate)
     if crossings is not None:
         tracked = replace(tracked, crossings=tuple(crossings))
-        identity.flag_unclear(tracked)
+        identity.flag_unclear(tracked, covering)
     subject = tracker.subject
     recording = fitted.recording
     fast = trust.why_too_fast(tracked.track, subject.length_mm)

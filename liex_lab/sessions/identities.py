@@ -23,7 +23,7 @@ from liex_lab.sessions.corrections import LogEntry, Roles, read_log
 from liex_lab.sessions.session import Session
 from liex_lab.tables.rows import ROUNDED_S, frame_count, rows_between
 from liex_lab.tracking.curve import track_whole
-from liex_lab.tracking.identity import flag_unclear
+from liex_lab.tracking.identity import covers, flag_unclear
 from liex_lab.tracking.observations import COLUMNS, Observations
 from liex_lab.tracking.track import Crossing, Subject, Tracked
 
@@ -195,10 +195,14 @@ def exchanged(
     index = session.frames["frame_index"].to_numpy(np.int64)
     order = shown(entries, [*members], index)
     own = [*members].index(session.metadata["individual"])
-    observed, subject = evidence.read_evidence(session)
+    every = [evidence.read_evidence(one) for one in members.values()]
+    observed, subject = every[own]
+    covering = covers([one for one, _ in every], subject.length_mm)[
+        order[:, own], np.arange(len(order))
+    ]
     remarks = []
     for k in sorted(set(order[:, own].tolist()) - {own}):
-        theirs, measured_as = evidence.read_evidence([*members.values()][k])
+        theirs, measured_as = every[k]
         rows = order[:, own] == k
         for name in COLUMNS:
             getattr(observed, name)[rows] = getattr(theirs, name)[rows]
@@ -207,11 +211,11 @@ def exchanged(
                 f"{rows.sum():,} frames were measured as {[*members][k]}, with a body of "
                 f"{measured_as.length_mm:.1f} mm instead of {subject.length_mm:.1f} mm."
             )
-    every = {one for other in members.values() for one in evidence.read_crossings(other) or ()}
-    crossings = [_reviewed(one, order, entries, index) for one in every]
+    known = {one for other in members.values() for one in evidence.read_crossings(other) or ()}
+    crossings = [_reviewed(one, order, entries, index) for one in known]
     met = sorted((one for one in crossings if own in one.animals), key=lambda one: one.start)
     tracked = replace(track_whole(subject, observed), crossings=tuple(met))
-    flag_unclear(tracked)
+    flag_unclear(tracked, covering)
     return observed, subject, tracked, remarks
 
 

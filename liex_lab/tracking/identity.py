@@ -100,7 +100,8 @@ def identify(
         _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
         bodies = np.stack([_misfit(one)[full] for one in observed])
         apart, weight = _independent(observed[0][full])
-        fits = _fits(bodies, apart, weight, states)
+        shown = np.any([_fitting(one[full], subjects[0].length_mm) for one in observed], axis=0)
+        fits = _fits(bodies, apart, weight * shown.all(axis=1), states)
         path, _ = _viterbi(transition, fits)
         size = np.log(np.maximum(observed[0].n_px[full, ::2], 1))
         sizes = fits + _sizes(size, bodies, weight * apart, states[path], states)
@@ -232,13 +233,54 @@ def _covering(
     return np.asarray(touching & (shown < (known.sum(axis=1) - _COVERED) * usual))
 
 
-def flag_unclear(tracked: Tracked) -> None:
+def _fitting(observed: Observations, length_mm: float) -> NDArray[np.bool_]:
+    """Whether (n, N) each component has a pose that the depth image does not contradict."""
+    found = observed.known[:, ::2]
+    for k, here in enumerate(found.T):
+        here &= ~contradicted(observed, np.full(len(here), 2 * k), length_mm)
+    return found
+
+
+def covers(own: Sequence[Observations], length_mm: float) -> NDArray[np.bool_]:
+    """Whether (N, n) animals may lie over another one, so that their poses may be that one's.
+
+    They touch something of about an animal's size; the other one has no pose that fits the depth,
+    and where it last had one, or has the next, is within a body length.
+
+    Args:
+        own: the observations (n) of each animal, see `own_observations`.
+        length_mm: of an animal.
+    """
+    fits = np.stack([_fitting(one, length_mm)[:, 0] for one in own])
+    touching = np.isfinite(own[0].objects[..., 0]).sum(axis=1) < len(own)
+    here = np.stack([one.centroid_mm[:, 0, :2] for one in own])
+    frames = np.arange(fits.shape[1])
+    out = np.zeros(fits.shape, np.bool_)
+    for shown, place in zip(fits, here, strict=True):
+        last = np.maximum.accumulate(np.where(shown, frames, 0))
+        after = np.minimum.accumulate(np.where(shown, frames, frames[-1])[::-1])[::-1]
+        for then in (last, after):
+            near = np.linalg.norm(here - place[then], axis=-1) < length_mm
+            out |= touching & ~shown & near
+    return out & fits
+
+
+def flag_unclear(tracked: Tracked, covering: NDArray[np.bool_] | None = None) -> None:
     """Flag the poses of a track in place: in crossings unclear where it is not clear whose they are
     or which end is the head; doubtful in those that begin before the animal stood apart.
+
+    Args:
+        tracked: the track.
+        covering: (n,) where it may lie over another animal, see `covers`; unclear unless reviewed.
     """
     first = int(np.argmax(tracked.track.posed))
+    covering = np.zeros(len(tracked.track.flag), np.bool_) if covering is None else covering.copy()
     for one in tracked.crossings or ():
-        flag = tracked.track.flag[one.start : one.stop]
+        covering[one.start : one.stop] &= not one.reviewed_by
+    flags = tracked.track.flag
+    flags[(flags == "") & covering] = "unclear"
+    for one in tracked.crossings or ():
+        flag = flags[one.start : one.stop]
         if one.start <= first:
             flag[flag == ""] = "doubtful"
         turned = tracked.track.p_flip[one.start : one.stop] > UNCLEAR
@@ -538,6 +580,7 @@ class OnlineIdentity:
     Attributes:
         p_swap: probability that animals have been exchanged in the present crossing, 0 without one.
         crossings: that of each earlier crossing, at its end.
+        covering: (N,) whether each animal may lie over another one, see `covers`.
 
     Args:
         subjects: the animals, the largest first.
@@ -556,6 +599,7 @@ class OnlineIdentity:
         self._until_s = np.inf  # of the present crossing, or until all stand apart
         self.p_swap = 0.0
         self.crossings: list[float] = []
+        self.covering = np.zeros(n_animals, np.bool_)
 
     def add(self, observed: Sequence[Observations]) -> list[Observations]:
         """The observations of each animal in the next frame, as from `own_observations`.
@@ -610,7 +654,11 @@ class OnlineIdentity:
         for name in _OF_COMPONENTS:
             getattr(self._last, name)[:, to] = getattr(first, name)[:, of]
         slots = np.where(known[best], best, NONE)
-        return [
+        own = [
             own_observations(one, slots[k : k + 1], self._usual_px)
             for k, one in enumerate(observed)
         ]
+        before = [own_observations(self._last, np.array([k])) for k in range(n_animals)]
+        both = [Observations.join(pair) for pair in zip(before, own, strict=True)]
+        self.covering = covers(both, self._subject.length_mm)[:, 1]
+        return own

@@ -174,6 +174,8 @@ def _counts(
     for act in acts:
         resting[act.start : act.stop] |= act.action == "huddle"
     found |= track_counts(distance / unit, time_s)
+    sure = np.where(trusted[:, None], distance / unit, np.nan)
+    found["trusted_swaps"] = track_counts(sure, time_s).get("swaps", 0)
     crossings = np.concatenate([np.zeros((0, 3)), *(one.crossings for one in individuals)])
     found |= crossing_counts(distance / unit, np.unique(crossings, axis=0))
     most_mm = _CAP_MM * unit
@@ -242,6 +244,7 @@ def _figures(counts: Counts) -> dict[str, Any]:
     figures: dict[str, Any] = {
         "swaps": int(counts["swaps"]),
         "swaps_per_contact_hour": counts["swaps"] / hours if hours else None,
+        "trusted_swaps": int(counts["trusted_swaps"]),
         **track_figures(counts),
         "joint_error_apart_mm": ratio("apart_mm", "n_apart"),
         "joint_error_contact_mm": ratio("contact_mm", "n_contact"),

@@ -10,6 +10,7 @@ from liex_lab.tracking.identity import (
     CERTAIN,
     UNCLEAR,
     OnlineIdentity,
+    covers,
     doubt,
     flag_unclear,
     identify,
@@ -168,6 +169,31 @@ def test_touching_animals_keep_their_poses_unless_they_cover_each_other() -> Non
     track = track_whole(one_of_two, own_observations(seen, slots)).track
     assert not ((track.flag == "") & track.observed)[LOST].any()
     assert (track.flag[: LOST.start] == "").all()
+
+
+def test_who_lies_over_another_animal_may_be_that_one() -> None:
+    one, other = (mixed(2, shuffled(2)) for _ in range(2))
+    slots = np.argsort(shuffled(2), axis=1)
+    own = [own_observations(seen, slots[:, k]) for k, seen in enumerate((one, other))]
+    for seen in own:  # one outline
+        seen.objects[LOST, 1] = np.nan
+    far = [replace(seen, centroid_mm=seen.centroid_mm.copy()) for seen in own]
+    for k, mm in ((0, 0.0), (1, 20.0)):
+        own[k].centroid_mm[:, :2] = mm
+        far[k].centroid_mm[:, :2] = 20.0 * mm
+    for seen in (own, far):
+        lose(seen[1], LOST)
+    over = covers(own, SUBJECT.length_mm)
+    assert np.flatnonzero(over[0]).tolist() == [*range(LOST.start, LOST.stop)]
+    assert not over[1].any()
+    assert not covers(far, SUBJECT.length_mm).any()  # it has gone elsewhere
+    tracked = track_whole(SUBJECT, own[0])
+    tracked = replace(tracked, crossings=(Crossing(45, 50, (0, 1), 0.0, "human", "Ada"),))
+    flag_unclear(tracked, over[0])
+    assert np.flatnonzero(tracked.track.flag == "unclear").tolist() == [
+        *range(40, 45),
+        *range(50, 55),
+    ]
 
 
 def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
