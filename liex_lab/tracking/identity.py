@@ -114,8 +114,13 @@ def identify(
         by = {"motion": np.zeros_like(sizes), "size": sizes, "rfid": emission}
         crossings = _crossings(observed[0], full, transition, by, path, states)
     for start, stop in _follow(observed, subjects[0].length_mm, slots, known):
-        unclear = Crossing(start, stop, tuple(range(n_animals)), 0.5, "motion")
-        others = [one for one in crossings if one.stop <= start or one.start >= stop]
+        met = [one for one in crossings if one.start < stop and start < one.stop]
+        first, last = (
+            min([start, *(one.start for one in met)]),
+            max([stop, *(one.stop for one in met)]),
+        )
+        unclear = Crossing(first, last, tuple(range(n_animals)), 0.5, "motion")
+        others = [one for one in crossings if one not in met]
         crossings = tuple(sorted([*others, unclear], key=lambda one: one.start))
     return _by_bodies(observed, replace(marked, slots=slots, crossings=crossings))
 
