@@ -113,9 +113,7 @@ class SessionAnimal:
     @cached_property
     def hold_s(self) -> Array:
         """(n,) duration of each frame, s."""
-        if self.kinematics is None or not len(self.kinematics):
-            return np.empty(0)
-        return hold_times(self.kinematics["time_s"].to_numpy(float))
+        return hold_times(self.frames["time_s"].to_numpy(float))
 
     def column(self, name: str) -> Array:
         """A column of `kinematics`, interrupted at gaps of the camera; no line crosses them."""

@@ -10,7 +10,7 @@ from matplotlib.patches import FancyArrowPatch, Rectangle
 
 from liex_lab.actions.vocabulary import PREDICTED_ERROR, UNLABELLED_COLOUR, action_colours
 from liex_lab.arrays import Array, NDArray
-from liex_lab.behaviour.activity import Around, around_onsets, hold_times
+from liex_lab.behaviour.activity import Around, around_onsets
 from liex_lab.behaviour.body import DrawnMeasure, drawn_measures
 
 from ..units import counted, shown
@@ -210,7 +210,7 @@ def error_distribution(animal: SessionAnimal) -> Figure | None:
         "Predicted error of a joint",
         animal,
         values,
-        hold_times(animal.frames["time_s"].to_numpy(float)),
+        animal.hold_s,
         "mm",
         PREDICTED_ERROR,
     )
@@ -260,13 +260,13 @@ def distribution(
         return None
     if not known.all():  # copies of a day are large
         values, hold_s = values[known], hold_s[known]
-    top = max(float(np.quantile(values, 0.99)), 1e-6)
+    median, most = (float(one) for one in np.quantile(values, [0.5, 0.99]))
+    top = max(most, 1e-6)
     share, edges = np.histogram(np.minimum(values, top), bins=30, range=(0.0, top), weights=hold_s)
     share = 100.0 * share / max(share.sum(), 1e-9)
     title = f"{title}, {animal.label}\nn = {counted(len(values), 'frame')}"
     figure, axes = one_panel((ONE_COLUMN_MM, 52.0), _SMALL_BOX, title)
     axes.bar(edges[:-1], share, np.diff(edges), align="edge", color=colour, gid="distribution")
-    median = float(np.median(values))
     axes.axvline(median, color=INK, linewidth=0.7, linestyle=(0, (3, 2)))
     right = median > 0.6 * top
     label = axes.annotate(

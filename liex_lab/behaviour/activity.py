@@ -312,19 +312,25 @@ def around_onsets(
     time_s = kinematics["time_s"].to_numpy(float)
     values = kinematics[column].to_numpy(float)
     grid = np.linspace(-BEFORE_S, AFTER_S, _STEPS)
-    wanted = own[:, None] + grid
-    after = np.clip(np.searchsorted(time_s, wanted), 1, len(time_s) - 1)
-    span = time_s[after] - time_s[after - 1]
-    share = np.divide(wanted - time_s[after - 1], span, out=np.zeros_like(wanted), where=span > 0)
-    found = values[after - 1] + share * (values[after] - values[after - 1])
     usual_s = float(np.median(np.diff(time_s)))
-    inside = (span <= GAP_FACTOR * usual_s) & (wanted >= time_s[0])
-    found = np.where(inside & (wanted <= time_s[-1]), found, np.nan)
-    enough = np.isfinite(found).sum(axis=0) >= _FEWEST
     quartiles = np.full((3, _STEPS), np.nan)
-    quartiles[:, enough] = np.nanpercentile(found[:, enough], [25.0, 50.0, 75.0], axis=0)
+    for part in blocks(_STEPS, 8):  # a day has tens of thousands of bouts
+        wanted = own[:, None] + grid[part]
+        after = np.clip(np.searchsorted(time_s, wanted), 1, len(time_s) - 1)
+        span = time_s[after] - time_s[after - 1]
+        share = np.divide(
+            wanted - time_s[after - 1], span, out=np.zeros_like(wanted), where=span > 0
+        )
+        found = values[after - 1] + share * (values[after] - values[after - 1])
+        inside = (span <= GAP_FACTOR * usual_s) & (wanted >= time_s[0])
+        found = np.where(inside & (wanted <= time_s[-1]), found, np.nan)
+        enough = np.isfinite(found).sum(axis=0) >= _FEWEST
+        quartiles[:, part][:, enough] = np.nanpercentile(
+            found[:, enough], [25.0, 50.0, 75.0], axis=0
+        )
     low, median, high = quartiles
-    return Around(grid, low, median, high, len(own)) if enough.any() else None
+    known = np.isfinite(median).any()
+    return Around(grid, low, median, high, len(own)) if known else None
 
 
 # Position of the animal: zone visits, thigmotaxis (outer half of an open field), novel tank test.

@@ -204,9 +204,9 @@ def frames_apart(times_ns: Times, step_ns: int) -> Times:
         times_ns: (n,) int64 stamps, ns, increasing.
         step_ns: the usual step, ns, above 0.
     """
-    dt = np.diff(times_ns)
     if rounded_step(times_ns):
         return _in_phase(times_ns, step_ns, 16)
+    dt = np.diff(times_ns)
     # the median of jittering steps is off by 1 %, which is refined with longer and longer gaps
     period = float(step_ns)
     long = dt > GAP_FACTOR * step_ns

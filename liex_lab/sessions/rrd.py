@@ -228,6 +228,7 @@ class ReplayWriter:
         self._stream.send_property("session", facts)
         self.flushed()
         self.abandon()
+        del self._index, self._elapsed  # large over a day, and the report needs the room
         try:
             self._count()
         except SessionError:
