@@ -4,7 +4,8 @@ Each message is one sentence: what was expected, what was found, what to do.
 """
 
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 
@@ -117,6 +118,20 @@ class MisfitError(EstimationError):
 
 class MissingPackageError(LiexError):
     """Raised if a required optional package is not installed."""
+
+
+@contextmanager
+def needing(extra: str, what: str) -> Iterator[None]:
+    """Raise MissingPackageError for an import in the block whose package is not installed.
+
+    Args:
+        extra: the optional dependencies with the package, see `how_to_install`.
+        what: what needs it, as the subject of a sentence.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingPackageError(f"{what} needs {error.name}; {how_to_install(extra)}") from None
 
 
 def did_you_mean(word: object, known: Iterable[str], form: str = "did you mean '{}'? ") -> str:

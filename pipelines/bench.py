@@ -15,7 +15,7 @@ from typing import Any
 from liex_lab.dashboards.app.data import StudyData
 from liex_lab.dashboards.report.report import write_views
 
-from liex_lab.errors import MissingPackageError, PlaceError, RecordingError, how_to_install
+from liex_lab.errors import PlaceError, RecordingError, needing
 from liex_lab.plan import known_plans
 from liex_lab.runtime import durable
 from liex_lab.runtime.processes import own_python
@@ -179,12 +179,8 @@ def serve_dashboard(
         MissingPackageError: the extra `dashboard` is not installed.
         StudyError: there is no such study.
     """
-    try:
+    with needing("dashboard", "the dashboard"):
         from liex_lab.dashboards.app.server import LOOPBACK, address, make_app, serve
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(
-            f"the dashboard needs {error.name}; {how_to_install('dashboard')}"
-        ) from None
     place = Path(study) if Path(study).is_dir() else Path(study).parent
     data = StudyData(*list_sessions(study))
     data.warm(progress)

@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, how_to_install, one_line
+from liex_lab.errors import LiexError, needing, one_line
 from liex_lab.recordings.formats.moseq_results import SHAPE
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
@@ -182,10 +182,6 @@ def syllable_labels(path: Path, session: Session) -> pd.DataFrame:
     """
     try:
         found = _syllables_of(path)
-    except ImportError as error:
-        raise LiexError(
-            f"to read {path}, {error.name} is missing; {how_to_install('exchange')}"
-        ) from None
     except (OSError, ValueError, KeyError) as error:
         raise LiexError(
             f"{path} should be the results of keypoint-MoSeq (a syllable per frame of every "
@@ -222,7 +218,8 @@ def _syllables_of(path: Path) -> dict[str, NDArray[np.int64]]:
         parts = table.groupby(of, sort=False) if of else [(path.stem, table)]
         found = {str(name): part[column].to_numpy(float) for name, part in parts}
     else:
-        import h5py
+        with needing("exchange", f"reading {path}"):
+            import h5py
 
         with h5py.File(path, "r") as file:
             found = {name: np.asarray(file[name]["syllable"][()], float) for name in file}

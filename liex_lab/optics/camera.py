@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from liex_lab.arrays import Array
+from liex_lab.arrays import Array, ArrayLike
 from liex_lab.errors import LiexError
 
 BROWN_CONRADY = "brown_conrady"

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from liex_lab.arrays import Mask, NDArray
 from liex_lab.optics.camera import Camera
 from liex_lab.scene.background import FloorLevel, learn_background, usual_depth
-from liex_lab.scene.floor import Depths, Mask, parts
+from liex_lab.scene.floor import Depths, parts
 
 
 @dataclass(frozen=True)

@@ -460,7 +460,7 @@ def learn_scene(
                 return replace(
                     even,
                     ground=ground,
-                    # of the time
+                    # unknown for more of the time than this, it is told
                     changed=ground if ground.unknown_share > 0.05 else None,
                     transient_objects=scene.transient_objects,
                 ), level

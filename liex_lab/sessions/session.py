@@ -19,7 +19,7 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import MissingPackageError, SessionError, how_to_install
+from liex_lab.errors import SessionError, needing
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera
 from liex_lab.runtime import durable, memory, text_files
@@ -396,12 +396,8 @@ class Session:
         Raises:
             MissingPackageError: xarray is not installed.
         """
-        try:
+        with needing("exchange", "a labelled data set"):
             import xarray
-        except ModuleNotFoundError:
-            raise MissingPackageError(
-                f"a labelled data set needs xarray; {how_to_install('exchange')}"
-            ) from None
 
         poses = points or self.pose_arrays()
         bouts = self.bouts

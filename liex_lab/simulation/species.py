@@ -6,7 +6,7 @@ in any order. `MouseSpecies` is the mouse, `FishSpecies` the zebrafish, `Generic
 with a skeleton.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -80,6 +80,7 @@ class Species:
         patch_px: side of training patches, px, enough for mice of up to 70 mm.
         other_builds: whether errors of tracks are also calibrated on builds not used in training.
         sources: source of the training images.
+        locomotion: how it goes, `locomotion.walk` or `locomotion.swim`.
     """
 
     skeleton: Skeleton
@@ -94,6 +95,7 @@ class Species:
     patch_px: ClassVar[int] = 144
     other_builds: ClassVar[bool] = True
     sources: ClassVar[str] = "rendered from a seed; no recording of an animal was used"
+    locomotion: ClassVar[Callable[..., tuple[Pose, Array]]] = staticmethod(walk)
 
     @property
     def protocol(self) -> str:
@@ -152,7 +154,7 @@ class Species:
         Returns:
             Poses (n) in the arena frame, and girths (n,).
         """
-        raise NotImplementedError
+        return self.locomotion(rng, scene, self.skeleton, shape, length, n)
 
     def bends(self, rng: np.random.Generator, n: int) -> Array | None:
         """Bends of tails, see `Surface.vertices`.
@@ -402,12 +404,6 @@ class MouseSpecies(Species):
         kinds = rng.choice(len(KINDS), len(size), p=SHARES)
         return sample_postures(rng, self.skeleton, size, shape, kinds)
 
-    def move(
-        self, rng: np.random.Generator, scene: SimulatedScene, shape: Any, length: float, n: int
-    ) -> tuple[Pose, Array]:
-        """A mouse that walks, turns, rears and curls up."""
-        return walk(rng, scene, self.skeleton, shape, length, n)
-
     def bends(self, rng: np.random.Generator, n: int) -> Array:
         """Bends of the tails (n, TAIL_RINGS), rad."""
         return draw_tail_bends(rng, n)
@@ -434,6 +430,7 @@ class FishSpecies(Species):
     sizes: tuple[float, float] = (25.0 / 30.0, 40.0 / 30.0)
     floats: bool = True
     frame_ns: int = 20_000_000
+    locomotion = staticmethod(swim)
 
     def postures(
         self, rng: np.random.Generator, size: Array, shape: Body, camera_mm: Array
@@ -454,12 +451,6 @@ class FishSpecies(Species):
         at = np.where(rng.random(n) < 0.12, rng.uniform(0.0, 0.06, n), rng.random(n))
         pose.root.translation[:, 2] += low + at * (headroom - low) + rng.uniform(0.5, 2.0, n)
         return pose, size
-
-    def move(
-        self, rng: np.random.Generator, scene: SimulatedScene, shape: Any, length: float, n: int
-    ) -> tuple[Pose, Array]:
-        """A fish that swims in bouts."""
-        return swim(rng, scene, self.skeleton, shape, length, n, step_s=self.frame_ns * 1e-9)
 
 
 # tilts from which the resting orientation on the floor is chosen

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
-from liex_lab.errors import MissingPackageError, RecordingError, how_to_install, one_line
+from liex_lab.errors import RecordingError, needing, one_line
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
 from liex_lab.recordings.formats.moseq import (
@@ -81,12 +81,8 @@ def open_results(
         RecordingError: the file is damaged or holds no such results, or the camera is unknown.
         MissingPackageError: h5py is not installed.
     """
-    try:
+    with needing("exchange", f"reading {path}"):
         import h5py
-    except ImportError as error:
-        raise MissingPackageError(
-            f"to read {path}, {error.name} is missing; {how_to_install('exchange')}"
-        ) from None
     try:
         file = h5py.File(path, "r")
         with closing_on_error(file):

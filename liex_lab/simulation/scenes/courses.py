@@ -8,7 +8,6 @@ and pitch are those of a walk, so that it does not rear. Truth is exact, as of a
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 import pandas as pd
@@ -16,7 +15,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter
 
 from liex_lab.arrays import Array
 from liex_lab.body.pose import Pose
-from liex_lab.errors import LiexError, MissingPackageError, how_to_install, one_line
+from liex_lab.errors import LiexError, needing, one_line
 from liex_lab.simulation.recording import Actor, RenderedRecording, Take
 from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import SimulatedScene
@@ -25,7 +24,7 @@ from liex_lab.simulation.scenes.places import Mesh
 from liex_lab.simulation.scenes.stage import draw_animal, timing_of
 from liex_lab.simulation.sensors import Sensor
 
-COURSES_HZ: Final = 30.0
+_HZ = 30.0
 _BACK = (9, 6, 3, 0)  # of the 12 points: tail base, middle of the back, base of the neck, nose
 _SURE = 0.3  # least confidence of a point
 _ROOM_MM = 20.0  # between the outermost point and a wall
@@ -47,12 +46,8 @@ def read_courses(path: Path) -> Array:
         MissingPackageError: h5py is not installed.
         LiexError: the file is no such file, or has no identities.
     """
-    try:
+    with needing("exchange", f"reading {path}"):
         import h5py
-    except ImportError as error:
-        raise MissingPackageError(
-            f"to read {path}, {error.name} is missing; {how_to_install('exchange')}"
-        ) from None
     try:
         with h5py.File(path) as file:
             poses = file["poseest"]
@@ -97,7 +92,7 @@ class _Making(Making):
         along = np.linalg.norm(np.diff(back, axis=1), axis=2).cumsum(axis=1)
         spine = _SPINE * float(np.quantile(along[:, -1], 0.75))  # stretched
         middle, ahead = arena.centre + back.mean(axis=1), back[:, -1] - back[:, 0]
-        speed = np.linalg.norm(np.gradient(middle, axis=0), axis=1) * COURSES_HZ / spine
+        speed = np.linalg.norm(np.gradient(middle, axis=0), axis=1) * _HZ / spine
         animal = draw_animal(
             self.seed,
             which,

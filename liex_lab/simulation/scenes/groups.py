@@ -16,7 +16,7 @@ import numpy as np
 
 from liex_lab.arrays import Array
 from liex_lab.geometry import SE3, so3
-from liex_lab.simulation.locomotion import GLIDE_S, smoothed, strokes, swim, walk
+from liex_lab.simulation.locomotion import GLIDE_S, smoothed, strokes
 from liex_lab.simulation.recording import Actor, RenderedRecording, Take
 from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import SimulatedScene, turned
@@ -466,7 +466,6 @@ class _Making(Making):
             if kind.swims
             else (lambda rng, n: (kinds, speed)),
             lambda rng, scene, spine_mm, mm_s: (place, heading),
-            swim if kind.swims else walk,
         )
         risen = smoothed(path[:, 4], 4.0)
         return animal if kind.swims else _risen(_aligned(animal, heading), risen)

@@ -10,15 +10,8 @@ from typing import Any
 import numpy as np
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.body.pose import Pose
 from liex_lab.body.shape import Surface
-from liex_lab.simulation.locomotion import (
-    Path,
-    free_path,
-    smoothed,
-    walk,
-    waver,
-)
+from liex_lab.simulation.locomotion import Path, free_path, smoothed, waver
 from liex_lab.simulation.recording import Actor, Take
 from liex_lab.simulation.scene import SimulatedScene
 from liex_lab.simulation.species import Species
@@ -36,7 +29,6 @@ def draw_animal(
     timing: tuple[NDArray[np.int64], NDArray[np.bool_]],
     script: Callable[..., Any] | None = None,
     path: Path | None = None,
-    going: Callable[..., tuple[Pose, Array]] = walk,
 ) -> Actor:
     """An animal that moves in an arena.
 
@@ -47,9 +39,8 @@ def draw_animal(
         arena: the arena.
         take: its length and the family of its body's shape.
         timing: index of the moment of its walk in each frame (n,), and its presence (n,).
-        script: its activity, see `going`.
+        script: its activity, see `locomotion.walk` and `locomotion.swim`.
         path: its path, likewise.
-        going: its locomotion, `locomotion.walk` or `locomotion.swim`.
     """
     moments, present = timing
     body = np.random.default_rng([seed, which, 1])
@@ -58,7 +49,9 @@ def draw_animal(
     shape = species.shapes(body, take.family, 1)
     n_moments = int(moments.max()) + 1
     motion, tail = (np.random.default_rng([seed, which, part]) for part in (2, 3))
-    pose, girth = going(motion, arena, species.skeleton, shape, spine, n_moments, script, path)
+    pose, girth = species.locomotion(
+        motion, arena, species.skeleton, shape, spine, n_moments, script, path
+    )
     bends = species.bends(tail, 1)
     if bends is not None:
         bends = (bends + waver(tail, (n_moments, bends.shape[1])))[moments]
