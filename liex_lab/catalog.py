@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from liex_lab.errors import LiexError, ModelError, did_you_mean
+from liex_lab.errors import LiexError, ModelError, did_you_mean, expecting
 
 _HERE = Path(__file__).resolve().parent
 MODELS = _HERE / "models"
@@ -135,12 +135,13 @@ def _read_card(path: Path) -> dict[str, Any]:
         raise ModelError(
             f"the model {path.stem} needs its card {path}, which is missing; install liex_lab again"
         )
-    try:
+    with expecting(
+        ModelError,
+        f"the model card {path} should be JSON",
+        ValueError,
+        advice="install liex_lab again",
+    ):
         card = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ModelError(
-            f"the model card {path} should be JSON, but: {error}; install liex_lab again"
-        ) from None
     if not isinstance(card, dict) or not isinstance(card.get("sha256"), str):
         raise ModelError(
             f"the model card {path} should state the model's sha256; make it again with `liex "

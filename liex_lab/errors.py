@@ -163,6 +163,25 @@ def one_line(error: BaseException) -> str:
     return text.strip().partition("\n")[0][:200] or type(error).__name__
 
 
+@contextmanager
+def expecting(
+    kind: type[LiexError], sentence: str, *caught: type[Exception], advice: str = ""
+) -> Iterator[None]:
+    """Report errors of other packages in the block as one sentence: what was expected, what came.
+
+    Args:
+        kind: class of the error.
+        sentence: what was expected, such as "FILE should be a TOML file".
+        *caught: classes of the errors.
+        advice: what to do.
+    """
+    try:
+        yield
+    except caught as error:
+        ending = f"; {advice}" if advice else ""
+        raise kind(f"{sentence}, but: {one_line(error)}{ending}") from None
+
+
 def refuse(kind: type[Exception], *checks: tuple[object, str]) -> None:
     """Raise the first error of a list of checks.
 

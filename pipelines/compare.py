@@ -27,7 +27,7 @@ from liex_lab.behaviour.cohort import (
     unit_of,
     usual_measures,
 )
-from liex_lab.errors import LiexError, SessionError
+from liex_lab.errors import LiexError, SessionError, expecting
 from liex_lab.plan.study import Study, same
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.progress import Progress, silent
@@ -309,12 +309,14 @@ def find_sessions(places: Sequence[str | Path]) -> list[Path]:
 
 def _overruled(table: pd.DataFrame, path: Path) -> pd.DataFrame:
     """The table with group, cage, sex and batch overridden by a CSV of the animals."""
-    try:
+    with expecting(
+        SessionError,
+        f"{path} should be a CSV with the column subject_id",
+        OSError,
+        ValueError,
+        advice="correct it",
+    ):
         stated = text_files.read_texts(path)
-    except (OSError, ValueError) as error:
-        raise SessionError(
-            f"{path} should be a CSV with the column subject_id, but: {error}; correct it"
-        ) from None
     if (
         "subject_id" not in stated
         or not set(stated.columns) & set(SUBJECT[1:])

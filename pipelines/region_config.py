@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import LiexError, PlanError, StudyError, one_line
+from liex_lab.errors import LiexError, PlanError, StudyError, expecting, one_line
 from liex_lab.optics.camera import Camera
 from liex_lab.plan import Plan, known_plans, plan, sections
 from liex_lab.plan.study import STUDY_FILE, PlannedSession, Study
@@ -49,10 +49,14 @@ def with_value(text: str, path: Keys, value: Any, origin: str = "the file") -> s
     Raises:
         PlanError: the text is not TOML, or is written in a form that cannot be edited in place.
     """
-    try:
+    with expecting(
+        PlanError,
+        f"{origin} should be a TOML file",
+        tomllib.TOMLDecodeError,
+        RecursionError,
+        advice="correct it",
+    ):
         wanted = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise PlanError(f"{origin} should be a TOML file, but: {error}; correct it") from None
     try:
         _set(wanted, path, value)
     except (IndexError, TypeError, AttributeError):

@@ -20,7 +20,7 @@ import pandas as pd
 
 from liex_lab.actions.ethogram import UNLABELLED, frame_words
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, one_line
+from liex_lab.errors import LiexError, expecting
 from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.text_files import clock_s, number, read_texts
 from liex_lab.tracking.track import Track, spans
@@ -45,12 +45,10 @@ def read_labels(path: str | Path) -> pd.DataFrame:
             it starts.
     """
     source = Path(path)
-    try:
+    with expecting(
+        LiexError, f"{source} should be a table of bouts, as CSV or parquet", OSError, ValueError
+    ):
         table = pd.read_parquet(source) if source.suffix == ".parquet" else read_texts(source)
-    except (OSError, ValueError) as error:
-        raise LiexError(
-            f"{source} should be a table of bouts, as CSV or parquet, but: {one_line(error)}"
-        ) from None
     lacking = [name for name in _NEEDED if name not in table]
     if lacking:
         raise LiexError(

@@ -15,7 +15,7 @@ from typing import Any
 import pandas as pd
 
 from liex_lab.actions.labels import HUMAN, checked
-from liex_lab.errors import LiexError, one_line
+from liex_lab.errors import LiexError, expecting
 from liex_lab.runtime.text_files import decoded, read_text, read_texts, split_lines
 from liex_lab.sessions import Session
 from liex_lab.sessions.session import found_video, video_path
@@ -135,7 +135,15 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
         LiexError: the file is not a BORIS project.
     """
     source = Path(path)
-    try:
+    with expecting(
+        LiexError,
+        f"{source} should be a BORIS project (JSON)",
+        OSError,
+        EOFError,
+        ValueError,
+        RecursionError,
+        zlib.error,
+    ):
         raw = source.read_bytes()
         if raw[:2] == b"\x1f\x8b":
             with gzip.open(io.BytesIO(raw)) as file:
@@ -143,10 +151,6 @@ def read_boris_project(path: str | Path) -> dict[str, Any]:
             if len(raw) > 1 << 28:
                 raise ValueError("it unpacks to more than 256 MB")
         document = json.loads(decoded(raw))
-    except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
-        raise LiexError(
-            f"{source} should be a BORIS project (JSON), but: {one_line(error)}"
-        ) from None
     if not isinstance(document, dict) or not isinstance(document.get("observations"), dict):
         raise LiexError(
             f"{source} should be a BORIS project, but holds no observations; save it from BORIS "
@@ -203,10 +207,8 @@ def boris_export_labels(path: str | Path) -> pd.DataFrame:
         LiexError: the file is not such an export.
     """
     source = Path(path)
-    try:
+    with expecting(LiexError, f"{source} should be an export of BORIS", OSError, ValueError):
         table = read_texts(source)
-    except (OSError, ValueError) as error:
-        raise LiexError(f"{source} should be an export of BORIS, but: {one_line(error)}") from None
     wanted = {
         "Observation id": "session_id",
         "Subject": "individual",

@@ -26,7 +26,7 @@ import numpy as np
 import pandas as pd
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, needing, one_line
+from liex_lab.errors import LiexError, expecting, needing
 from liex_lab.recordings.formats.moseq_results import SHAPE
 from liex_lab.runtime.text_files import write_csv
 from liex_lab.sessions import Session
@@ -180,13 +180,15 @@ def syllable_labels(path: Path, session: Session) -> pd.DataFrame:
     Raises:
         LiexError: the file cannot be read, or is not of this session, frame by frame.
     """
-    try:
+    with expecting(
+        LiexError,
+        f"{path} should be the results of keypoint-MoSeq (a syllable per frame of every "
+        "recording) or a moseq_df.csv",
+        OSError,
+        ValueError,
+        KeyError,
+    ):
         found = _syllables_of(path)
-    except (OSError, ValueError, KeyError) as error:
-        raise LiexError(
-            f"{path} should be the results of keypoint-MoSeq (a syllable per frame of every "
-            f"recording) or a moseq_df.csv, but: {one_line(error)}"
-        ) from None
     name = session.name if len(found) > 1 else next(iter(found), "")
     time_s = session.frames["time_s"].to_numpy()
     numbers = found.get(name, np.empty(0))

@@ -17,7 +17,7 @@ import pandas as pd
 from pydantic import Field
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, did_you_mean, how_to_install, one_line, refuse
+from liex_lab.errors import LiexError, did_you_mean, expecting, how_to_install, one_line, refuse
 from liex_lab.plan.sections import Positive, SettingsTable
 from liex_lab.runtime.memory import check_npz
 from liex_lab.runtime.text_files import read_text, read_toml, split_lines
@@ -72,16 +72,18 @@ class PointNames(SettingsTable):
         Raises:
             LiexError: the file cannot be read, or an entry is unknown or invalid.
         """
-        try:
+        with expecting(
+            LiexError,
+            f"the table of names {path or ''} should be a TOML file with any of "
+            f"{', '.join(PointNames.model_fields)}",
+            OSError,
+            ValueError,
+            advice="correct it",
+        ):
             return PointNames.model_validate(
                 ({} if path is None else read_toml(Path(path)))
                 | {name: value for name, value in stated.items() if value is not None}
             )
-        except (OSError, ValueError) as error:
-            raise LiexError(
-                f"the table of names {path or ''} should be a TOML file with any of "
-                f"{', '.join(PointNames.model_fields)}, but: {one_line(error)}; correct it"
-            ) from None
 
     def of_joints(self, joints: Sequence[str], points: Sequence[str]) -> dict[str, list[str]]:
         """The file's points of each joint, in the joints' order; joints without points are absent.

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 
 from pydantic import Field, ValidationError, model_validator
 
-from liex_lab.errors import PlanError, did_you_mean
+from liex_lab.errors import PlanError, did_you_mean, expecting
 from liex_lab.plan.sections import (
     Actions,
     AnimalSettings,
@@ -145,10 +145,8 @@ class Plan(SettingsTable):
                 f"there is no plan '{plan}': {did_you_mean(plan, known)}bundled are: "
                 f"{', '.join(known) or 'none'}, or give the path of a .toml file"
             )
-        try:
+        with expecting(PlanError, f"the plan {path} should be a TOML file", ValueError):
             text = read_text(path)
-        except ValueError as error:
-            raise PlanError(f"the plan {path} should be a TOML file, but: {error}") from None
         return Plan.from_toml(text, origin=str(path))
 
     @staticmethod
@@ -162,12 +160,13 @@ class Plan(SettingsTable):
         Raises:
             PlanError: the text is not TOML, or a setting is invalid.
         """
-        try:
+        with expecting(
+            PlanError,
+            f"{origin} should be a TOML file",
+            ValueError,
+            advice="compare it with `liex info --plan`",
+        ):
             table = parse_toml(text)
-        except ValueError as error:
-            raise PlanError(
-                f"{origin} should be a TOML file, but: {error}; compare it with `liex info --plan`"
-            ) from None
         return Plan.from_table(table, origin)
 
     @staticmethod

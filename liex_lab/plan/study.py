@@ -20,7 +20,7 @@ from urllib.parse import parse_qsl
 
 from pydantic import Field, ValidationError, model_validator
 
-from liex_lab.errors import PlanError, StudyError, did_you_mean, refuse
+from liex_lab.errors import PlanError, StudyError, did_you_mean, expecting, refuse
 from liex_lab.plan import Plan, known_plans
 from liex_lab.plan.sections import ArenaPlace, SettingsTable, first_twice
 from liex_lab.runtime import durable, text_files
@@ -256,10 +256,10 @@ class Study:
             file = file / STUDY_FILE
         if not file.is_file():
             raise StudyError(f"there is no study file {file}; `liex cohort init FOLDER` begins one")
-        try:
+        with expecting(
+            StudyError, f"{file} should be a TOML file", ValueError, advice="correct it"
+        ):
             table = text_files.read_toml(file)
-        except ValueError as error:
-            raise StudyError(f"{file} should be a TOML file, but: {error}; correct it") from None
         return Study.from_table(table, file)
 
     @staticmethod

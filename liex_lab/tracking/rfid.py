@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, one_line, refuse
+from liex_lab.errors import LiexError, expecting, refuse
 from liex_lab.plan.sections import Rfid
 from liex_lab.runtime.text_files import number, read_texts
 from liex_lab.scene.scene import Arena
@@ -86,16 +86,17 @@ def read_readings(stated: Rfid, last_s: float, n_animals: int, arena: Arena) -> 
             tags than animals.
     """
     source = Path(stated.readings)
-    try:
+    with expecting(
+        LiexError,
+        f"{source} should be a table of RFID readings with the columns {', '.join(_COLUMNS)}, "
+        "as CSV",
+        OSError,
+        ValueError,
+    ):
         table = read_texts(source)
         if lacking := ", ".join(name for name in _COLUMNS if name not in table):
             raise ValueError(f"it lacks {lacking}")
         time_s = np.array([float(number(text)) for text in table["time_s"]]) + stated.offset_s
-    except (OSError, ValueError) as error:
-        raise LiexError(
-            f"{source} should be a table of RFID readings with the columns {', '.join(_COLUMNS)}, "
-            f"as CSV, but: {one_line(error)}"
-        ) from None
     antenna, tag = (table[name].to_numpy(str) for name in _COLUMNS[1:])
     places = {name: (*one.centre, one.radius) for name, one in stated.antennas.items()}
     unknown = sorted({*antenna} - {*places})

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from liex_lab.body.skeleton import Array, Skeleton
-from liex_lab.errors import LiexError, refuse
+from liex_lab.errors import LiexError, expecting, refuse
 from liex_lab.evaluation.scores import (
     FAR,
     MeasuredIndividual,
@@ -203,11 +203,20 @@ def given_cases(where: Path, plan: Plan, shares: Array) -> tuple[list[Foreign], 
                 "recording, such as NAME.mcap"
             )
         recording, bodies = cases.get(beside[0]) or (open_recording(beside[0]), {})
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                body = truth_of(dict(file), path.name, recording, shares)
-        except (OSError, ValueError, EOFError, TypeError, BadZipFile) as error:
-            raise LiexError(f"{path} should be a truth file, but: {error}; {TRUTH_FORM}") from None
+        with (
+            expecting(
+                LiexError,
+                f"{path} should be a truth file",
+                OSError,
+                ValueError,
+                EOFError,
+                TypeError,
+                BadZipFile,
+                advice=TRUTH_FORM,
+            ),
+            np.load(path, allow_pickle=False) as file,
+        ):
+            body = truth_of(dict(file), path.name, recording, shares)
         if low <= body.spine_mm <= high:
             bodies[letter.strip("_")] = body
             cases[beside[0]] = recording, bodies

@@ -22,7 +22,7 @@ import pandas as pd
 from liex_lab.arrays import Array, NDArray
 from liex_lab.baselines.baseline import Baseline, Guesses, PlainMean
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import EstimationError, LiexError, PlanError
+from liex_lab.errors import EstimationError, LiexError, PlanError, expecting
 from liex_lab.estimation.estimator import Estimates, PoseEstimator
 from liex_lab.estimation.method import METHODS
 from liex_lab.evaluation.scores import (
@@ -441,12 +441,13 @@ def evaluate_reference(session: str | Path, reference: str | Path) -> dict[str, 
         LiexError: the table cannot be read, lacks a column, or has no reliable row for any frame.
     """
     opened = Session.open(session)
-    try:
+    with expecting(
+        LiexError,
+        f"{reference} should be a table with one row a frame, as CSV",
+        OSError,
+        ValueError,  # pandas' own errors
+    ):
         table = pd.read_csv(reference)
-    except (OSError, ValueError) as error:  # pandas' own errors are ValueErrors
-        raise LiexError(
-            f"{reference} should be a table with one row a frame, as CSV, but: {error}"
-        ) from None
     needed = {"frame", "centroid_x_px", "centroid_y_px", "angle_rad"}
     if not needed <= set(table.columns):
         raise LiexError(

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from liex_lab.errors import MissingPackageError, StudyError, how_to_install, one_line
+from liex_lab.errors import MissingPackageError, StudyError, expecting, how_to_install
 from liex_lab.plan import plans_folder
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.processes import n_cores, worker_environment
@@ -157,13 +157,13 @@ class SlurmTable(BaseModel):
             raise StudyError(
                 f"there is no file {file}; copy {plans_folder() / 'slurm.toml'} and change the copy"
             )
-        try:
+        with expecting(
+            StudyError,
+            f"{file} should be a TOML file like the bundled slurm.toml",
+            ValueError,
+            advice="correct it",
+        ):
             return SlurmTable.model_validate(text_files.read_toml(file))
-        except ValueError as error:
-            raise StudyError(
-                f"{file} should be a TOML file like the bundled slurm.toml, but: "
-                f"{one_line(error)}; correct it"
-            ) from None
 
 
 # Jobs of a Slurm cluster, requested again if one ends before the study does.

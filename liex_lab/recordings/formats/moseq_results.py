@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
-from liex_lab.errors import RecordingError, needing, one_line
+from liex_lab.errors import RecordingError, expecting, needing, one_line
 from liex_lab.optics.camera import Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile, rate
 from liex_lab.recordings.formats.moseq import (
@@ -83,15 +83,17 @@ def open_results(
     """
     with needing("exchange", f"reading {path}"):
         import h5py
-    try:
+    with expecting(
+        RecordingError,
+        f"{path} should be the results of moseq2-extract (HDF5)",
+        OSError,
+        RuntimeError,
+        KeyError,  # as h5py reports damage
+        advice="copy it again, or give the recording itself",
+    ):
         file = h5py.File(path, "r")
         with closing_on_error(file):
             return _recording(path, file, camera, fps)
-    except (OSError, RuntimeError, KeyError) as error:  # as h5py reports damage
-        raise RecordingError(
-            f"{path} should be the results of moseq2-extract (HDF5), but: {one_line(error)}; copy "
-            "it again, or give the recording itself"
-        ) from None
 
 
 def _recording(path: Path, file: h5py.File, camera: Lens | None, fps: float | None) -> Recording:

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter1d, median_filter
 
 from liex_lab.arrays import Array
 from liex_lab.body.pose import Pose
-from liex_lab.errors import LiexError, needing, one_line
+from liex_lab.errors import LiexError, expecting, needing
 from liex_lab.simulation.recording import Actor, RenderedRecording, Take
 from liex_lab.simulation.rendering import Solid
 from liex_lab.simulation.scene import SimulatedScene
@@ -48,18 +48,22 @@ def read_courses(path: Path) -> Array:
     """
     with needing("exchange", f"reading {path}"):
         import h5py
-    try:
-        with h5py.File(path) as file:
-            poses = file["poseest"]
-            points = poses["points"][:][:, :, _BACK, ::-1] * [1.0, -1.0]
-            sure = poses["confidence"][:][:, :, _BACK] > _SURE
-            identity = poses["instance_embed_id"][:]
-            n_animals, scale = len(poses["instance_id_center"]), poses.attrs["cm_per_pixel"]
-    except (OSError, KeyError, IndexError) as error:
-        raise LiexError(
-            f"{path} is no pose file of JABS with identities ({one_line(error)}); expected HDF5 "
-            "with poseest/points, confidence, instance_embed_id and instance_id_center"
-        ) from None
+    with (
+        expecting(
+            LiexError,
+            f"{path} should be a pose file of JABS with identities (HDF5 with poseest/points, "
+            "confidence, instance_embed_id and instance_id_center)",
+            OSError,
+            KeyError,
+            IndexError,
+        ),
+        h5py.File(path) as file,
+    ):
+        poses = file["poseest"]
+        points = poses["points"][:][:, :, _BACK, ::-1] * [1.0, -1.0]
+        sure = poses["confidence"][:][:, :, _BACK] > _SURE
+        identity = poses["instance_embed_id"][:]
+        n_animals, scale = len(poses["instance_id_center"]), poses.attrs["cm_per_pixel"]
     backs = np.full((len(points), n_animals, *points.shape[2:]), np.nan)
     for k in range(n_animals):
         frame, row = np.nonzero(identity == k + 1)

@@ -15,7 +15,7 @@ import numpy as np
 from liex_lab.arrays import Array, ArrayLike, NDArray
 from liex_lab.body.pose import Fit, Pose, fit_poses
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import LiexError, RecordingError
+from liex_lab.errors import LiexError, RecordingError, expecting
 from liex_lab.geometry import SE3
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
@@ -146,9 +146,9 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
         raise RecordingError(
             f"there is no {JOINT_FILE} in {folder}; copy it there from the data set"
         )
-    try:
-        found: dict[str, Any] = loadmat(path, variable_names=wanted)
-    except (
+    with expecting(
+        RecordingError,
+        f"{path} should be the NYU data set's MATLAB file",
         NotImplementedError,
         ValueError,
         TypeError,
@@ -156,10 +156,9 @@ def read_nyu_joints(folder: Path, view: int = VIEW) -> NyuJoints:
         EOFError,
         MemoryError,
         MatReadError,
-    ) as error:
-        raise RecordingError(
-            f"{path} should be the NYU data set's MATLAB file, but: {error}; copy it again"
-        ) from None
+        advice="copy it again",
+    ):
+        found: dict[str, Any] = loadmat(path, variable_names=wanted)
     missing = [name for name in wanted if name not in found]
     if missing:
         raise RecordingError(
