@@ -326,16 +326,13 @@ def _measure_animals(
 
 def arena_settings(arena: sections.SeveralArenas, name: str) -> tuple[str, ...]:
     """The settings that turn a plan of several arenas into that of one arena's session, `name`."""
-    settings = [
-        "arenas=",
-        f"arena.region={toml_value(arena.region)}",
-        f"session.name={toml_value(name)}",
-    ]
-    for fact in ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age"):
-        if (value := getattr(arena, fact)) is not None:
-            settings.append(f"session.{fact}={toml_value(value)}")
-    if arena.zones is not None:
-        settings.append(f"arena.zones={toml_value(arena.zones)}")
-    if arena.spine_mm is not None:
-        settings.append(f"animal.spine_mm={arena.spine_mm!r}")
-    return tuple(settings)
+    facts = ("individual", "subject_id", "group", "cage", "sex", "batch", "species", "age")
+    stated = {
+        "arena.region": arena.region,
+        "session.name": name,
+        **{f"session.{fact}": getattr(arena, fact) for fact in facts},
+        "arena.zones": arena.zones,
+        "animal.spine_mm": arena.spine_mm,
+    }
+    known = ((key, value) for key, value in stated.items() if value is not None)
+    return ("arenas=", *(f"{key}={toml_value(value)}" for key, value in known))

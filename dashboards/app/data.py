@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 import numpy as np
 import pandas as pd
 
-from liex_lab.actions.vocabulary import PALETTE, action_colours
 from liex_lab.behaviour import cohort
 from liex_lab.errors import LiexError, SessionError, one_line
 from liex_lab.runtime.progress import Progress, silent
@@ -269,24 +268,6 @@ def shown_words(ethograms: Iterable[SessionBouts]) -> list[str]:
         for word, (start, stop) in zip(one.words, one.spans_s, strict=True):
             seconds[word] = seconds.get(word, 0.0) + float(stop - start)
     return sorted(seconds, key=lambda word: (-seconds[word], word))
-
-
-def colours_of(words: Sequence[str], vocabulary: Sequence[str] = ()) -> dict[str, str]:
-    """A colour for each word: its own colour of report and replay if it is free.
-
-    Words beyond the last colour share a grey.
-
-    Args:
-        words: the words, the most important first.
-        vocabulary: all words, in the order of their colours in report and replay.
-    """
-    own = action_colours(vocabulary)
-    chosen: dict[str, str] = {}
-    for word in words:
-        if word in own and own[word] not in chosen.values():
-            chosen[word] = own[word]
-    free = iter([colour for colour in PALETTE if colour not in chosen.values()])
-    return {word: chosen.get(word) or next(free, GREY) for word in words}
 
 
 def raster(

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from werkzeug.exceptions import NotFound
 
-from liex_lab.actions.vocabulary import PALETTE, UNLABELLED_COLOUR
+from liex_lab.actions.vocabulary import PALETTE, UNLABELLED_COLOUR, action_colours
 from liex_lab.behaviour import body, cohort
 from liex_lab.errors import LiexError, SessionError
 from liex_lab.plan.study import references_first
@@ -49,7 +49,6 @@ from .data import (
     OTHER,
     SessionBouts,
     StudyData,
-    colours_of,
     raster,
     shown_words,
 )
@@ -332,7 +331,8 @@ def ethogram_rows(data: StudyData) -> dict[str, Any]:
     ones = data.ethograms(keys)
     words = shown_words(ones.values())
     vocabulary = dict.fromkeys(word for one in ones.values() for word in one.vocabulary)
-    coloured = colours_of(words[: len(PALETTE)], list(vocabulary))
+    # those of report and replay, which belong to the whole vocabulary, if they are free
+    coloured = action_colours(words[: len(PALETTE)], action_colours(list(vocabulary)))
     colours = {**coloured, "unlabelled": UNLABELLED_COLOUR, NO_POSE: NO_POSE_COLOUR}
     if len(words) > len(PALETTE):
         colours[OTHER] = GREY

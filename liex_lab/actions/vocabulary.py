@@ -437,12 +437,17 @@ _OWN = {
 }
 
 
-def action_colours(words: Sequence[str]) -> dict[str, str]:
-    """The colour of each word of a vocabulary, as #rrggbb; colours repeat beyond the palette."""
+def action_colours(words: Sequence[str], own: Mapping[str, str] = _OWN) -> dict[str, str]:
+    """The colour of each word, as #rrggbb; colours repeat beyond the palette.
+
+    Args:
+        words: a vocabulary, or some of its words, the most important first.
+        own: the colours that words have if no earlier one has them.
+    """
     chosen: dict[str, str] = {}
     for word in words:
-        if _OWN.get(word, "") not in {"", *chosen.values()}:
-            chosen[word] = _OWN[word]
+        if own.get(word, "") not in {"", *chosen.values()}:
+            chosen[word] = own[word]
     left = cycle([colour for colour in PALETTE if colour not in chosen.values()] or PALETTE)
     return {word: chosen.get(word) or next(left) for word in words}
 

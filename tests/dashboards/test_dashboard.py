@@ -21,11 +21,9 @@ from hypothesis import strategies as st
 from liex_lab.dashboards.app import tables
 from liex_lab.dashboards.app.data import (
     _FACTS,
-    GREY,
     NO_POSE,
     SessionBouts,
     StudyData,
-    colours_of,
     raster,
 )
 from liex_lab.dashboards.app.pages import ethogram_rows, moved_to
@@ -165,13 +163,11 @@ def test_numbers_of_a_column_have_the_same_digits(values: list[float], shown: li
     assert [row[0]["text"] for row in filled["rows"]] == shown
 
 
-def test_no_two_actions_share_a_colour_but_the_grey_ones() -> None:
-    n = len(PALETTE)
-    colours = list(colours_of([f"w{k}" for k in range(n + 3)]).values())
-    assert len(set(colours[:n])) == n
-    assert set(colours[n:]) == {GREY}
+def test_no_two_actions_share_a_colour() -> None:
+    own = action_colours([f"w{k}" for k in range(len(PALETTE))])
+    assert len(set(own.values())) == len(PALETTE)
     words = ["rear", "run", "walk", "pause"]
-    assert colours_of(["walk", "rear", "unheard"], words) == {
+    assert action_colours(["walk", "rear", "unheard"], action_colours(words)) == {
         "walk": action_colours(words)["walk"],
         "rear": action_colours(words)["rear"],
         "unheard": PALETTE[0],
