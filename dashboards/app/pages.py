@@ -122,7 +122,7 @@ class Pages:
         return render_template("sessions.html", counts=counts)
 
     def refresh(self) -> Any:
-        """Read the states of the sessions again."""
+        """Read the states of the sessions again, and list them."""
         self.data.refresh()
         return redirect("/", 303)
 
@@ -170,11 +170,6 @@ class Pages:
     def bench_state(self) -> Any:
         """What the job has done."""
         return jsonify(self._bench().state())
-
-    def bench_done(self) -> Any:
-        """The sessions, with the one that was measured."""
-        self.data.refresh()
-        return redirect("/", 303)
 
     def _bench(self) -> Any:
         if self.measuring is None:

@@ -239,7 +239,7 @@ def make_app(
         "GET /review": shown.review,
         "GET /bench": shown.bench,
         "GET /bench/state": shown.bench_state,
-        "GET /bench/done": shown.bench_done,
+        "GET /bench/done": shown.refresh,
         "POST /bench/start": shown.bench_start,
         "POST /bench/stop": shown.bench_stop,
         "GET /arena/<path:key>": shown.arena,

@@ -19,6 +19,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from liex_lab.actions import _semi_markov_kernels as kernels
 from liex_lab.actions.channels import (
@@ -234,7 +235,9 @@ class TimelineModel:
             high = min(m, ticks.stop + margin)
             around = Segment(segment.times_s[low:high], segment.values[low:high])
             named = [
-                np.mean([_softmax(network.logits(some)) for network in self.networks], axis=0)
+                np.mean(
+                    [softmax(network.logits(some), axis=1) for network in self.networks], axis=0
+                )
                 for some in feature_blocks(around, names, _AT_ONCE)
             ]
             p = np.concatenate(named)[ticks.start - low : ticks.stop - low]
@@ -546,8 +549,3 @@ def _runs(
         (index[str(word)], float(ends[b - 1] - times_ns[a]) * 1e-9)
         for a, b, word in zip(*runs_of(words), strict=True)
     ]
-
-
-def _softmax(logits: Array) -> Array:
-    e = np.exp(logits - logits.max(axis=1, keepdims=True))
-    return np.asarray(e / e.sum(axis=1, keepdims=True))

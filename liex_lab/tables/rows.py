@@ -257,15 +257,8 @@ class Rows:
         Args:
             flips: spans of exchanged or uncertain head and tail, in order of time.
         """
-        time = self.time_s
-        count = frame_count(self.frame_index)
-        stops = stop_times(time)
         return {
-            **self._keys,
-            "start_s": np.array([time[flip.start] for flip in flips]),
-            "stop_s": np.array([stops[flip.stop - 1] for flip in flips]),
-            "start_frame": np.array([count[flip.start] for flip in flips], np.int64),
-            "stop_frame": np.array([count[flip.stop] for flip in flips], np.int64),
+            **self._spans(flips),
             "p_flip": np.array([flip.p_flip for flip in flips], float),
             "applied": np.array([flip.applied for flip in flips], bool),
             "source": np.array([flip.source for flip in flips], str),
@@ -278,15 +271,8 @@ class Rows:
         Args:
             crossings: in which the animal takes part, in order of time.
         """
-        time = self.time_s
-        count = frame_count(self.frame_index)
-        stops = stop_times(time)
         return {
-            **self._keys,
-            "start_s": np.array([time[one.start] for one in crossings]),
-            "stop_s": np.array([stops[one.stop - 1] for one in crossings]),
-            "start_frame": np.array([count[one.start] for one in crossings], np.int64),
-            "stop_frame": np.array([count[one.stop] for one in crossings], np.int64),
+            **self._spans(crossings),
             "animals": np.array(
                 [";".join(f"animal{k + 1}" for k in one.animals) for one in crossings], str
             ),
@@ -312,6 +298,18 @@ class Rows:
                 known = (frame, frame + (not lost), gap.n_frames_missing, gap.reason)
                 found.append((*span, *known, *_NOWHERE))
         return found
+
+    def _spans(self, spans: Sequence[Flip] | Sequence[Crossing]) -> Block:
+        """The keys of spans of rows, and when they start and stop."""
+        time, count = self.time_s, frame_count(self.frame_index)
+        stops = stop_times(time)
+        return {
+            **self._keys,
+            "start_s": np.array([time[one.start] for one in spans]),
+            "stop_s": np.array([stops[one.stop - 1] for one in spans]),
+            "start_frame": np.array([count[one.start] for one in spans], np.int64),
+            "stop_frame": np.array([count[one.stop] for one in spans], np.int64),
+        }
 
     @property
     def _keys(self) -> dict[str, str]:
