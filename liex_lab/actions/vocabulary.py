@@ -260,6 +260,7 @@ class Interaction(NamedTuple):
         meaning: the sentence; names in braces are settings of the plan's section `interactions`.
         mabe: its name in the MABe challenge of 2025; '' if that has none.
         mutual: both animals do it.
+        ends: a mutual one that depends on which end is the head.
         layered: it may happen at the same time as others; of those that are not layered, one
             animal does one at a time to another, the first in the order of `INTERACTIONS`.
         not_in: words in whose frames a layered one is not named.
@@ -268,6 +269,7 @@ class Interaction(NamedTuple):
     meaning: str
     mabe: str = ""
     mutual: bool = False
+    ends: bool = False
     layered: bool = False
     not_in: tuple[str, ...] = ()
 
@@ -298,6 +300,7 @@ INTERACTIONS: dict[str, Interaction] = {
         "quarter, and one of the heads points at the other nose within {nose_angle_rad:g} rad",
         "sniffface",
         mutual=True,
+        ends=True,
     ),
     "nose_to_tail_base": Interaction(
         "the agent's nose is within {nose_mm:g} mm of the target's tail base, nearest to its rear "
@@ -312,12 +315,14 @@ INTERACTIONS: dict[str, Interaction] = {
     "side_by_side_same": Interaction(
         "noses and tail bases are within {side_by_side_mm:g} mm of each other",
         mutual=True,
+        ends=True,
         layered=True,
         not_in=("mount",),
     ),
     "side_by_side_opposite": Interaction(
         "each nose is within {side_by_side_mm:g} mm of the other's tail base",
         mutual=True,
+        ends=True,
         layered=True,
         not_in=("mount",),
     ),
@@ -342,9 +347,9 @@ INTERACTIONS: dict[str, Interaction] = {
         layered=True,
     ),
     "avoid": Interaction(
-        "the agent goes away faster than {moving_mm_s:g} mm/s while the target, {near_mm:g} to "
-        "{avoid_mm:g} mm from its skin, comes towards it faster than {moving_mm_s:g} mm/s and does "
-        "not follow",
+        "the agent goes away or aside, faster than {moving_mm_s:g} mm/s and not towards the "
+        "target, while that one, {contact_mm:g} to {avoid_mm:g} mm from its skin, comes towards it "
+        "faster than {moving_mm_s:g} mm/s and does not follow",
         "avoid",
         layered=True,
         not_in=("follow",),

@@ -467,7 +467,9 @@ def raw_labels(
     }
 
 
-def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int64]) -> Mask:
+def hysteresis(
+    values: Array, enter: float, leave: float, number: NDArray[np.int64], *, trim: bool = False
+) -> Mask:
     """(n,) bool: the runs above `leave` that reach `enter`, separately in every stretch.
 
     It is True until the values fall below `leave`. The frames between `leave` and `enter` just
@@ -479,6 +481,7 @@ def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int
         enter: upper threshold, in the unit of `values`.
         leave: lower threshold, in the unit of `values`.
         number: (n,) unbroken stretch of each frame, see `segments`.
+        trim: begin and end with values of `enter` or more; those below it are only bridged.
     """
     high = values >= enter
     inside = values >= leave
@@ -487,7 +490,9 @@ def hysteresis(values: Array, enter: float, leave: float, number: NDArray[np.int
         inside, number, -1 - number
     )  # a run of one group is within one stretch, all above `leave` or all below
     for start, stop, which in constant_runs(group):
-        out[start:stop] = which >= 0 and bool(high[start:stop].any())
+        rows = start + np.flatnonzero(high[start:stop])
+        if which >= 0 and len(rows):
+            out[slice(rows[0], rows[-1] + 1) if trim else slice(start, stop)] = True
     return out
 
 

@@ -3,17 +3,19 @@ which other.
 
 The words are `actions.vocabulary.INTERACTIONS`, their limits the plan's section `interactions`. A
 rule is the least of relative margins, 1 - d / D of a distance d within D and v / V - 1 of a speed v
-above V: an interaction reaches 0 and lasts until below -hysteresis, then pauses are bridged and
-short ones dropped, as for bouts. Distances between skins are those of two tubes around the
-mid-axes, as thick as the skeleton's body:
+above V: an interaction begins and ends with a margin of 0 or more, and pauses above -hysteresis
+belong to it; then short pauses are bridged and short ones dropped, as for bouts. Distances between
+skins are those of two tubes around the mid-axes, as thick as the skeleton's body:
 
     gap = min_ij |a_i - b_j| - r_i - r_j    (mm),  a_i, b_j: points along the two mid-axes.
 
 Frames in which either animal has no trusted pose are not observed: no interaction includes them,
 and shares are of the observed time of the pair. Poses are interpolated over pauses up to `merge_s`.
 Frames in which it is not clear which of them is which count for mutual words only, without a
-direction. Sources: Live Mouse Tracker (de Chaumont et al. 2019, Nature Biomedical Engineering
-3:930) and deepof (Bordes et al. 2023, Nature Communications 14:4319).
+direction; where it is not clear which end is the head, words that depend on it neither begin nor
+end, and pauses so far within their limits belong to them. Sources: Live Mouse Tracker (de Chaumont
+et al. 2019, Nature Biomedical Engineering 3:930) and deepof (Bordes et al. 2023, Nature
+Communications 14:4319).
 
 An animal that another one lies over has no pose, but their outline distinguishes it from one that
 is merely hidden: its area lacks part of an animal, the volume below it does not, as the upper one
@@ -41,6 +43,7 @@ from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.runtime.memory import blocks
 from liex_lab.tables.rows import Rows, frame_count, stop_times
 from liex_lab.tables.schema import INTERACTIONS, to_pandas
+from liex_lab.tracking.identity import UNCLEAR
 from liex_lab.tracking.track import CORRECTED, Track, whole_gaps
 
 _ALONG = np.linspace(0.0, 1.0, 13)  # places along the body, from the front (0) to the rear (1)
@@ -63,6 +66,7 @@ class Individual:
         joints_mm: (n, J, 3) arena frame; NaN without a pose.
         trusted: (n,) bool, whether the pose was measured and nothing contradicts it.
         clear: (n,) bool, whether it is clear that this is the animal; None if it always is.
+        ends: (n,) bool, whether it is clear which end is the head; None if it always is.
     """
 
     name: str
@@ -70,13 +74,15 @@ class Individual:
     joints_mm: Array
     trusted: Mask
     clear: Mask | None = None
+    ends: Mask | None = None
 
     @staticmethod
     def of_track(name: str, track: Track) -> "Individual":
         """The animal of a track."""
         clear = np.asarray(track.flag != "unclear")
         trusted = track.observed & (np.isin(track.flag, ["", CORRECTED]) | ~clear)
-        return Individual(name, track.skeleton, track.joints_mm, trusted, clear)
+        turned = ~clear & (track.p_flip > UNCLEAR)
+        return Individual(name, track.skeleton, track.joints_mm, trusted, clear, ~turned)
 
     def bridged(self, time_s: Array, most_s: float) -> "Individual":
         """The animal with poses interpolated where it has none for most_s or less."""
@@ -89,7 +95,10 @@ class Individual:
             self.skeleton,
             joints.reshape(self.joints_mm.shape),
             known | whole_gaps(time_s, known, most_s),
-            (np.ones_like(known) if self.clear is None else self.clear)[last],
+            *(
+                (np.ones_like(known) if one is None else one)[last]
+                for one in (self.clear, self.ends)
+            ),
         )
 
 
@@ -294,6 +303,7 @@ def _radii(skeleton: Skeleton, body: BodyAxis) -> Array:
     across = np.linalg.norm(skin - ends[0] - along[:, None] * axis, axis=1)
     place = np.abs(along[:, None] / skeleton.length - _ALONG).argmin(axis=1)
     radius = [np.median(across[place == k]) if (place == k).any() else np.nan for k in range(13)]
+    radius[0] = -along.min()  # at the tip of the nose: the tube ends where the skin does
     there = np.isfinite(radius)
     return np.asarray(np.interp(_ALONG, _ALONG[there], np.array(radius)[there]))
 
@@ -390,7 +400,9 @@ class _Arena:
         self.time_s, self.limits, self.outlines = time_s, limits, outlines
         self.animals = [_Course.of(one, time_s, limits) for one in animals]
         self.stop_s = stop_times(time_s)
-        self.known, self.clear = np.swapaxes([(one.trusted, one.clear) for one in animals], 0, 1)
+        self.known, self.clear, self.ends = np.swapaxes(
+            [(one.trusted, one.clear, one.ends) for one in animals], 0, 1
+        )
 
     @cached_property
     def relations(self) -> dict[tuple[int, int], _Toward]:
@@ -400,11 +412,11 @@ class _Arena:
             for i, j in permutations(range(len(self.animals)), 2)
         }
 
-    def observed(self, *animals: int, mutual: bool = False) -> Mask:
+    def observed(self, *animals: int, mutual: bool = False, ends: bool = False) -> Mask:
         """(n,) bool, the frames in which these animals, or all, have a trusted pose, and it is
-        clear which is which unless the word is mutual.
+        clear which is which unless the word is mutual, and if `ends` which end is the head.
         """
-        known = self.known if mutual else self.known & self.clear
+        known = self.known & (self.clear | mutual) & (self.ends | (not ends))
         return np.asarray(known[list(animals) or slice(None)].all(axis=0))
 
     def events(self) -> Iterator[_Event]:
@@ -425,7 +437,8 @@ class _Arena:
         """Rows [start, stop) and score of each interaction with a margin (n,) in free frames."""
         limits = self.limits
         least = {"huddle": limits.huddle_s, "isolated": limits.isolated_s}.get(word, limits.min_s)
-        mask = hysteresis(margin, 0.0, -limits.hysteresis, number) & free
+        margin = np.where(free, margin, np.nan)
+        mask = hysteresis(margin, 0.0, -limits.hysteresis, number, trim=True)
         spans = tidy(mask, free, number, self.time_s, self.stop_s, limits.merge_s, least)
         return [(a, b, float((margin[a:b] >= 0.0).mean())) for a, b in spans]
 
@@ -505,6 +518,7 @@ class _Arena:
         still = [_within(one.speed, limits.still_mm_s) for one in (a, b)]
         moving = [_over(one.speed, limits.moving_mm_s) for one in (a, b)]
         goes, comes = to.closing, back.closing
+        doubt = np.where(self.ends[[i, j]].all(axis=0), np.inf, -1e-9)  # such frames only bridge
         straight = np.abs(goes) >= np.sqrt(0.5) * a.speed
         rules: dict[str, Sequence[Array]] = {
             "mount": (to.above, _within(to.angle, limits.mount_angle_rad)),
@@ -548,14 +562,19 @@ class _Arena:
                 _where((goes < comes) & straight),
             ),
             "avoid": (
-                _over(-goes, limits.moving_mm_s),
+                moving[0],
+                _where(goes < 0.0),
                 _over(comes, limits.moving_mm_s),
                 _within(to.gap, limits.avoid_mm),
-                _where(to.gap > limits.near_mm),
+                _where(to.gap > limits.contact_mm),
             ),
         }
         without = _WALKERS if a.swims else ()
-        return {word: np.min(rules[word], axis=0) for word in rules if word not in without}
+        return {
+            word: np.minimum(np.min(own, axis=0), doubt if WORDS[word].ends else np.inf)
+            for word, own in rules.items()
+            if word not in without
+        }
 
     def _trail(self, i: int, j: int, number: NDArray[np.int64]) -> tuple[Array, Array]:
         """Of the places of j's tail base within `follow_s`, the nearest to i's nose: its distance
@@ -638,10 +657,10 @@ def _totals(arena: _Arena, found: Sequence[_Event], names: Sequence[str]) -> pd.
             if (word == "isolated") != (target < 0) or (swims and word in _WALKERS):
                 continue
             both = () if target < 0 else (agent, target)
-            observed = arena.observed(*both, mutual=one.mutual)
+            observed = arena.observed(*both, mutual=one.mutual, ends=one.ends)
             either = ((agent, target), (target, agent)) if one.mutual else ((agent, target),)
             own = [event for event in found if event.word == word and event[:2] in either]
-            for event in own:  # mounts are found without both poses
+            for event in own:  # mounts are found without both poses, others bridge doubts
                 observed[event.start : event.stop] = True
             observed_s = float(hold[observed].sum())
             first_s = float(arena.time_s[observed][0]) if observed.any() else np.nan

@@ -687,7 +687,10 @@ class InteractionThresholds(SettingsTable):
         1.0, description="the agent of a mutual contact came nearer by more in this time before it"
     )
     hysteresis: NotNegative = Field(
-        0.2, lt=1, description="an interaction ends beyond its limits by more than this share"
+        0.2,
+        lt=1,
+        description="pauses in which limits are exceeded by this share at most belong to an "
+        "interaction",
     )
     merge_s: NotNegative = Field(
         0.33, description="shorter interruptions are bridged (LMT: 10 frames)"

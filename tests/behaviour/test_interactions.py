@@ -163,6 +163,41 @@ def test_short_pauses_of_a_measurement_are_bridged(lost, frames):
     assert own["observed_s"].to_numpy() == pytest.approx((80 - lost) / HZ)
 
 
+def test_an_interaction_begins_and_ends_within_its_limits():
+    """Side by side at 70, 45, 55, 45 and 70 mm: 50 mm is the limit, 60 mm within 20 % of it."""
+    y = np.interp(np.arange(180), [0, 40, 60, 90, 120, 140, 179], [70, 45, 45, 55, 45, 45, 70])
+    moves = mouse("b", lambda t: (np.array(0.0), y, np.array(0.0)))
+    found = events(mouse("a", still(0.0, 0.0)), moves).query("action == 'side_by_side_same'")
+    within = np.flatnonzero(y <= 50.0)
+    span = found[["start_frame", "stop_frame"]].to_numpy().tolist()
+    assert span == [[within[0], within[-1] + 1]]
+
+
+@pytest.mark.parametrize(("sure", "stop"), [(170, 180), (180, 100)])
+def test_poses_whose_head_is_in_doubt_only_bridge_what_depends_on_it(sure, stop):
+    a, b, frame = mouse("a", still(0.0, 0.0)), mouse("b", still(0.0, 32.0)), np.arange(180)
+    b = replace(b, ends=(frame < 100) | (frame >= sure))
+    found = find_interactions(frame / HZ, [a, b])
+    ends = found.events.set_index("action")["stop_frame"]
+    assert (ends["side_by_side_same"], ends["huddle"], ends["contact"]) == (stop, 180, 180)
+    seen = found.totals.query("action == 'side_by_side_same'")["observed_s"].to_numpy()
+    assert seen == pytest.approx(stop / HZ)
+
+
+@pytest.mark.parametrize(("way", "words"), [(np.pi / 2 - 0.1, ["avoid"]), (np.pi / 2 + 0.5, [])])
+def test_going_aside_avoids_one_that_comes(way, words):
+    """a goes from 120 mm before b's nose, b comes along x."""
+    t0 = 1.0
+
+    def leaves(t: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        far = 200.0 * np.clip(t - t0, 0.0, 0.5)
+        return 190.0 + far * np.cos(way), far * np.sin(way), np.array(way)
+
+    b = mouse("b", lambda t: (100.0 * np.clip(t - t0, 0, 0.5), np.array(0.0), np.array(0.0)), 3.0)
+    found = events(mouse("a", leaves, 3.0), b)
+    assert said(found, "avoid") == [("a", "b", word) for word in words]
+
+
 def covered_pair(turned: float = 0.0, **of_b: Any) -> tuple[list[Individual], np.ndarray]:
     """Two mice, a behind b, and their outlines: in frames 90 to 150 b has no pose, and one outline
     shows 1.3 mice whose volume is that of 1.95.
