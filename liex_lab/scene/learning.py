@@ -460,7 +460,7 @@ def learn_scene(
                 return replace(
                     even,
                     ground=ground,
-                    # unknown for more of the time than this, it is told
+                    # unknown for more of the time than this, it is reported
                     changed=ground if ground.unknown_share > 0.05 else None,
                     transient_objects=scene.transient_objects,
                 ), level

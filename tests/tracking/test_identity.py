@@ -178,11 +178,10 @@ def test_who_lies_over_another_animal_may_be_that_one() -> None:
     for seen in own:  # one outline
         seen.objects[LOST, 1] = np.nan
     far = [replace(seen, centroid_mm=seen.centroid_mm.copy()) for seen in own]
-    for k, mm in ((0, 0.0), (1, 20.0)):
-        own[k].centroid_mm[:, :2] = mm
-        far[k].centroid_mm[:, :2] = 20.0 * mm
-    for seen in (own, far):
-        lose(seen[1], LOST)
+    for some, mm in ((own, 20.0), (far, 400.0)):
+        some[0].centroid_mm[:, :2] = 0.0
+        some[1].centroid_mm[:, :2] = mm
+        lose(some[1], LOST)
     over = covers(own, SUBJECT.length_mm)
     assert np.flatnonzero(over[0]).tolist() == [*range(LOST.start, LOST.stop)]
     assert not over[1].any()
