@@ -6,7 +6,8 @@ are damaged.
 
 Callers that refuse damage (`open_recording(..., strict=True)`) open a file by its index instead,
 without unpacking its chunks, if the index lists every message that the file's statistics count.
-Only the beginning of each depth message, with the sensor's stamp, is unpacked; a chunk is checked
+Each chunk is unpacked up to the beginning of its last depth message, for the sensor's stamps, which
+takes most of the time of opening and is not repeated by `Recording.reopen`; a chunk is checked
 against its CRC-32 when a frame in it is read. Any other file is walked.
 
 `open_replay` opens session.mcap, which liex_lab wrote with the times of its frames: no stamp is
