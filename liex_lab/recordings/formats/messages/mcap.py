@@ -4,11 +4,11 @@ Records (opcode, u64 length, content) are walked in file order; messages are in 
 lz4). Schemas and channels are also read from the summary at the file's end, in case the first ones
 are damaged.
 
-Callers that refuse damage (`open_recording(..., strict=True)`) open a file by its index instead,
-without unpacking its chunks, if the index lists every message that the file's statistics count.
-Each chunk is unpacked up to the beginning of its last depth message, for the sensor's stamps, which
-takes most of the time of opening and is not repeated by `Recording.reopen`; a chunk is checked
-against its CRC-32 when a frame in it is read. Any other file is walked.
+Callers that refuse damage (`open_recording(..., strict=True)`) open a file by its index instead, if
+the index lists every message that the file's statistics count. For the sensor's stamps, each chunk
+is unpacked up to the beginning of its last depth message. This takes most of the time of opening,
+and `Recording.reopen` does not repeat it. A chunk is checked against its CRC-32 when a frame in it
+is read. Any other file is walked.
 
 `open_replay` opens session.mcap, which liex_lab wrote with the times of its frames: no stamp is
 read, because single frames of a long recording are needed quickly.
