@@ -20,7 +20,7 @@ from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Camera
 from liex_lab.recordings.formats.images.folder import natural_key
 from liex_lab.recordings.frame import Depth
-from liex_lab.recordings.recording import Recording
+from liex_lab.recordings.recording import Recording, SourceFiles
 from liex_lab.recordings.timestamp_files import name_numbers
 from liex_lab.recordings.timestamps import CLOCK_JUMP_NS
 from liex_lab.runtime.progress import Progress, silent
@@ -40,11 +40,12 @@ class _Part:
     camera: Camera
     times_ns: NDArray[np.int64]
     faults: NDArray[np.uint8]
-    sources: tuple[Path, ...]
     problems: tuple[str, ...]
     doubts: tuple[str, ...]
     truncated: bool
     metadata: dict[str, Any]
+    files: SourceFiles
+    reopen: Callable[[], Recording] | None
 
     @staticmethod
     def read(path: Path, open_part: Opener) -> "_Part":
@@ -56,11 +57,12 @@ class _Part:
                 one.camera,
                 one.times_ns,
                 one.stamp_faults,
-                one.sources,
                 tuple(one.problems),
                 tuple(one.doubts),
                 one.truncated,
                 one.metadata,
+                one.files,
+                one.reopen,
             )
 
 
@@ -89,15 +91,18 @@ class _OpenParts:
     def _at(self, k: int) -> Recording:
         with self._lock:
             if k not in self._open:
-                path = self._parts[k].path
+                known = self._parts[k]
+                reopen = known.reopen if known.files.stamp == known.files.stamp_at_opening else None
                 try:
-                    part = self._open_part(path)
-                except RecordingError as error:
-                    raise RecordingError(f"{path.name} can be read no more: {error}") from None
-                if not np.array_equal(part.times_ns, self._parts[k].times_ns):
+                    part = reopen() if reopen else self._open_part(known.path)
+                except (RecordingError, OSError) as error:
+                    raise RecordingError(
+                        f"{known.path.name} can be read no more: {error}"
+                    ) from None
+                if not np.array_equal(part.times_ns, known.times_ns):
                     part.close()
                     raise RecordingError(
-                        f"{path} changed while it was measured; run the same command again"
+                        f"{known.path} changed while it was measured; run the same command again"
                     )
                 if len(self._open) == _N_OPEN:  # a part closes when nobody reads from it any more
                     del self._open[next(iter(self._open))]
@@ -159,7 +164,7 @@ def join_parts(
         camera=parts[0].camera,
         times_ns=np.concatenate([part.times_ns for part in parts]),
         read=opened.read,
-        sources=[file for part in parts for file in part.sources],
+        sources=[file for part in parts for file in part.files.paths],
         problems=opened.problems,
         truncated=any(part.truncated for part in parts),
         metadata=parts[0].metadata,

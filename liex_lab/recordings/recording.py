@@ -172,6 +172,8 @@ class Recording:
             see `measurements`.
         optics: corrections applied on reading (distortion, water, mirroring), empty if none; see
             `rectify`.
+        reopen: opens the same, unchanged files once more, without what takes long the first time;
+            None if nothing does.
         unpacked: folder with the unpacked archive, which opens as the same recording while this one
             is open; None if nothing was unpacked.
         region_px: (u, v) corners, pixels, of the polygon outside of which all pixels are unread; ()
@@ -234,6 +236,7 @@ class Recording:
         self._step_ns = median_step(self.times_ns) if step_ns is None else step_ns
         self._whole: Recording | None = None
         self._grow = grow
+        self.reopen: Callable[[], Recording] | None = None
         self._closed = False
         if not len(self.times_ns):
             raise RecordingError(f"{name} holds no frame; a recording has at least one")

@@ -319,7 +319,7 @@ def in_background(make: Callable[[], Item]) -> Iterator[Callable[[], Item]]:
 def side_by_side(do: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Apply a function to each item on as many threads as kernels may use; results in order.
 
-    For work on whole frames by numpy and OpenCV, which release the GIL.
+    For work that releases the GIL, such as on whole frames by numpy and OpenCV, or unpacking.
 
     Args:
         do: the function; must not change data of other items.

@@ -112,9 +112,12 @@ def test_what_is_whole_of_a_cut_part_is_read_if_asked_for_and_the_rest_is_a_gap(
         np.testing.assert_array_equal(parts.frame(N - n_lost - 1).depth, FRAMES[-1])
 
 
-def test_a_part_that_changed_after_the_recording_was_opened_is_not_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("strict", [False, True])
+def test_a_part_that_changed_after_the_recording_was_opened_is_not_read(
+    tmp_path: Path, strict: bool
+) -> None:
     write_mcap_parts(tmp_path, FRAMES)
-    with open_recording(tmp_path / "*.mcap") as parts:
+    with open_recording(tmp_path / "*.mcap", strict=strict) as parts:
         (tmp_path / "cam1_1.mcap").write_bytes((tmp_path / "cam1_2.mcap").read_bytes())
         with pytest.raises(RecordingError, match="changed while it was measured"):
             parts.frame(3)

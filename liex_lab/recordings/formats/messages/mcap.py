@@ -4,10 +4,11 @@ Records (opcode, u64 length, content) are walked in file order; messages are in 
 lz4). Schemas and channels are also read from the summary at the file's end, in case the first ones
 are damaged.
 
-Callers that refuse damage (`open_recording(..., strict=True)`) open a file by its index instead,
-without unpacking its chunks, if the index lists every message that the file's statistics count.
-Only the beginning of each depth message, with the sensor's stamp, is unpacked; a chunk is checked
-against its CRC-32 when a frame in it is read. Any other file is walked.
+Callers that refuse damage (`open_recording(..., strict=True)`) open a file by its index instead, if
+the index lists every message that the file's statistics count. For the sensor's stamps, each chunk
+is unpacked up to the beginning of its last depth message. This takes most of the time of opening,
+and `Recording.reopen` does not repeat it. A chunk is checked against its CRC-32 when a frame in it
+is read. Any other file is walked.
 
 `open_replay` opens session.mcap, which liex_lab wrote with the times of its frames: no stamp is
 read, because single frames of a long recording are needed quickly.
@@ -16,9 +17,11 @@ read, because single frames of a long recording are needed quickly.
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
+from threading import Lock
 from typing import IO
 
 import numpy as np
@@ -26,6 +29,7 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from liex_lab.errors import RecordingError
 from liex_lab.optics.camera import Lens
@@ -44,6 +48,7 @@ from liex_lab.recordings.formats.messages.messages import (
 )
 from liex_lab.recordings.formats.messages.parsers import plain_schema, stamp_reader
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.processes import side_by_side
 from liex_lab.runtime.progress import Progress, silent
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -57,6 +62,7 @@ _CHUNK = struct.Struct(
     "<QQQII"
 )  # first and last log time, unpacked size, its CRC, length of the packing's name
 FACTS = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA)
+Stamps = dict[int, NDArray[np.void]]  # of the messages that an index lists, by channel
 LARGEST_FACT = 1 << 24  # bytes of one such record
 DAMAGE = (
     McapError,
@@ -77,6 +83,7 @@ def open_mcap(
     progress: Progress = silent,
     topic: str | None = None,
     strict: bool = False,
+    stamps: Stamps | None = None,
 ) -> Recording:
     """Open one depth topic of an MCAP file as a recording.
 
@@ -88,6 +95,7 @@ def open_mcap(
         topic: name of the depth topic; None for the only one.
         strict: open the file by its index if possible; reading a frame in a damaged chunk then
             raises a `RecordingError`.
+        stamps: those read when the same, unchanged file was opened before.
 
     Returns:
         The recording; reading resumes if the file grows (`Recording.grown`), unless strict.
@@ -95,9 +103,12 @@ def open_mcap(
     Raises:
         RecordingError: the file is not MCAP, or has no depth topic to choose.
     """
+    known: Stamps = {} if stamps is None else stamps
     file = open_file(path)
-    opened = IndexedMcap(path, file) if strict else McapFile(path, file)
-    return open_topic(opened, "mcap", camera, topic, progress)
+    opened = IndexedMcap(path, file, known) if strict else McapFile(path, file)
+    recording = open_topic(opened, "mcap", camera, topic, progress)
+    recording.reopen = partial(open_mcap, path, camera, fps, silent, topic, strict, known)
+    return recording
 
 
 def open_replay(path: Path, progress: Progress = silent) -> Recording:
@@ -327,6 +338,8 @@ class McapFile(MessageFile):
 _UNKNOWN = -1  # the length of a message is only stated in its chunk
 _INDEX = struct.Struct("<HI")  # of a message index: channel, bytes of its entries
 _ENTRY = np.dtype([("time_ns", "<u8"), ("offset", "<u8")])
+# of a message: whether it could be read, the sensor's stamp and its time of sending
+_STAMP = np.dtype([("is_whole", "?"), ("stamp_ns", "<i8"), ("sent_ns", "<u8")])
 _HEAD = 512  # first bytes of a message's record, with its stamp
 
 _Table = tuple[int, bytes]  # number of a chunk, and times and offsets of messages as written
@@ -335,10 +348,17 @@ _Table = tuple[int, bytes]  # number of a chunk, and times and offsets of messag
 class IndexedMcap(McapFile):
     """An MCAP file that is complete according to its index; any other is walked."""
 
-    def __init__(self, path: Path, file: IO[bytes], is_replay: bool = False) -> None:
-        """Keep an open file; the times of logging in a replay are those of its frames."""
+    def __init__(
+        self, path: Path, file: IO[bytes], stamps: Stamps | None = None, is_replay: bool = False
+    ) -> None:
+        """Keep an open file; the times of logging in a replay are those of its frames.
+
+        `stamps` are those known; the others are added.
+        """
         super().__init__(path, file)
         self._is_replay = is_replay
+        self._stamps: Stamps = {} if stamps is None else stamps
+        self._lock = Lock()
 
     def walk(self, wanted: IsRelevant, progress: Progress) -> Iterator[Envelope | IndexedMessages]:
         """The messages of the wanted channels, by channel: the first of each with its data."""
@@ -427,49 +447,63 @@ class IndexedMcap(McapFile):
     def _stamped(self, channel_id: int, listed: IndexedMessages) -> IndexedMessages | None:
         """Messages with the sensor's stamps; None if reading these needs whole messages."""
         channel = listed.channel
-        if self._is_replay or plain_schema(channel) in CALIBRATION_SCHEMAS:
+        is_calibration = plain_schema(channel) in CALIBRATION_SCHEMAS
+        if self._is_replay or is_calibration or not len(listed.places):
             return listed
         read = stamp_reader(channel)
         if read is None:
             return None
-        # for each message whether it could be read, its stamp and its time of sending, ns
-        places = listed.places
-        table = np.zeros((len(places), 3), np.int64)
-        for rows in np.split(np.arange(len(places)), np.flatnonzero(np.diff(places[:, 0])) + 1):
-            if not len(rows):
-                continue
-            try:
-                chunk = self.believable(int(places[rows[0], 0]))
-                offsets = places[rows, 1].tolist()
-                self.file.seek(chunk.offset)
-                packed = self.file.read(chunk.length)
-                data = unpacked(packed, chunk, min(offsets[-1] + _HEAD, chunk.size))
-                heads = [data[at : at + _HEAD] for at in offsets]
-                for row, head in zip(rows.tolist(), heads, strict=True):
-                    opcode, length = RECORD.unpack_from(head)
-                    whose, _, log_ns, sent_ns = MESSAGE.unpack_from(head, RECORD.size)
-                    if (opcode, whose, log_ns) != (
-                        Opcode.MESSAGE,
-                        channel_id,
-                        listed.log_time_ns[row],
-                    ):
-                        raise DamagedChunk("there is another message than in its index")
-                    begin = RECORD.size + MESSAGE.size
-                    stamp_ns = read(memoryview(head)[begin : RECORD.size + length])
-                    if stamp_ns is None:
-                        return None
-                    table[row] = 1, stamp_ns, np.uint64(sent_ns).view(np.int64)
-            except (*DAMAGE, DamagedChunk):
-                table[rows, 0] = 0
-        good = table[:, 0] == 1
+        if channel_id not in self._stamps:
+            edges = np.flatnonzero(np.diff(listed.places[:, 0])) + 1
+            split = np.split(np.arange(len(listed.places)), edges)
+            found = side_by_side(partial(self._stamps_in_chunk, read, channel_id, listed), split)
+            tables = [table for table in found if table is not None]
+            if len(tables) < len(found):
+                return None
+            self._stamps[channel_id] = np.concatenate(tables)
+        table = self._stamps[channel_id]
+        good = table["is_whole"]
         self.whole = self.whole and bool(good.all())
         return IndexedMessages(
             channel,
             listed.log_time_ns[good],
             listed.places[good],
-            table[good, 1],
-            table[good, 2].view(np.uint64),
+            table["stamp_ns"][good],
+            table["sent_ns"][good],
         )
+
+    def _stamps_in_chunk(
+        self,
+        read: Callable[[memoryview], int | None],
+        channel_id: int,
+        listed: IndexedMessages,
+        rows: NDArray[np.int64],
+    ) -> NDArray[np.void] | None:
+        """A `_STAMP` for each of these messages, which are in one chunk.
+
+        None if the beginnings of messages do not contain their stamps.
+        """
+        stamps = []
+        try:
+            chunk = self.believable(int(listed.places[rows[0], 0]))
+            offsets = listed.places[rows, 1].tolist()
+            with self._lock:
+                self.file.seek(chunk.offset)
+                packed = self.file.read(chunk.length)
+            data = unpacked(packed, chunk, min(offsets[-1] + _HEAD, chunk.size))
+            for at, listed_ns in zip(offsets, listed.log_time_ns[rows].tolist(), strict=True):
+                head = memoryview(data)[at : at + _HEAD]
+                opcode, length = RECORD.unpack_from(head)
+                whose, _, log_ns, sent_ns = MESSAGE.unpack_from(head, RECORD.size)
+                if (opcode, whose, log_ns) != (Opcode.MESSAGE, channel_id, listed_ns):
+                    raise DamagedChunk("there is another message than in its index")
+                stamp_ns = read(head[RECORD.size + MESSAGE.size : RECORD.size + length])
+                if stamp_ns is None:
+                    return None
+                stamps.append((True, stamp_ns, sent_ns))
+            return np.array(stamps, _STAMP)
+        except (*DAMAGE, DamagedChunk):
+            return np.zeros(len(rows), _STAMP)
 
     def read(self, place: MessagePlace) -> memoryview:
         """The data of one message; an unknown length is read from its chunk.
