@@ -7,7 +7,7 @@ are read once; afterwards the last two parts that were read from are open.
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, takewhile
 from pathlib import Path
 from threading import Lock
@@ -155,6 +155,12 @@ def join_parts(
         raise RecordingError(
             f"{paths[0].parent} holds several recordings: {error}; give one of these in it: {offer}"
         ) from None
+    times_ns = np.concatenate([part.times_ns for part in parts])
+    ends = np.cumsum([len(part.times_ns) for part in parts])
+    parts = [  # a day has the times in memory once
+        replace(part, times_ns=own)
+        for part, own in zip(parts, np.split(times_ns, ends[:-1]), strict=True)
+    ]
     opened = _OpenParts(parts, open_part)
     doubts = [*_messages(parts, "doubts"), *_order_doubt(parts)]
     opened.problems += _pauses(parts)
@@ -162,7 +168,7 @@ def join_parts(
         name=_common_name(paths),
         format=parts[0].format,
         camera=parts[0].camera,
-        times_ns=np.concatenate([part.times_ns for part in parts]),
+        times_ns=times_ns,
         read=opened.read,
         sources=[file for part in parts for file in part.files.paths],
         problems=opened.problems,

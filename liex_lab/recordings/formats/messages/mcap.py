@@ -15,6 +15,7 @@ read, because single frames of a long recording are needed quickly.
 """
 
 import struct
+import tempfile
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -48,6 +49,7 @@ from liex_lab.recordings.formats.messages.messages import (
 )
 from liex_lab.recordings.formats.messages.parsers import plain_schema, stamp_reader
 from liex_lab.recordings.recording import Recording
+from liex_lab.runtime.memory import on_disk
 from liex_lab.runtime.processes import side_by_side
 from liex_lab.runtime.progress import Progress, silent
 
@@ -460,7 +462,8 @@ class IndexedMcap(McapFile):
             tables = [table for table in found if table is not None]
             if len(tables) < len(found):
                 return None
-            self._stamps[channel_id] = np.concatenate(tables)
+            held = on_disk(Path(tempfile.gettempdir()))((len(listed.places),), _STAMP)
+            self._stamps[channel_id] = np.concatenate(tables, out=held)
         table = self._stamps[channel_id]
         good = table["is_whole"]
         self.whole = self.whole and bool(good.all())
