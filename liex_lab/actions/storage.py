@@ -151,7 +151,8 @@ def load_action_model(name: str | Path, folder: Path = MODELS) -> TimelineModel:
     Raises:
         ModelError: there is no such model, or the file cannot be used.
     """
-    path = find_action_model(name, folder)
+    own = f"a {SUFFIX} file made by `liex train actions`"
+    path = find_file(name, folder, SUFFIX, "action model", own)
     try:
         document = read_plain(path)
         if document["format"] not in (_FORMAT, _WITHOUT_PEAKS):
@@ -234,23 +235,6 @@ def check_timeline(model: TimelineModel) -> None:
         raise ValueError(f"its actions should last between 0 and {_LONGEST_S:.0f} s")
     for network in model.networks:
         check_layers(network, k)
-
-
-def find_action_model(name: str | Path, folder: Path = MODELS) -> Path:
-    """The file of a bundled model or of a path.
-
-    Args:
-        name: the animal, or a path.
-        folder: of the bundled models.
-
-    Returns:
-        A path that is a file.
-
-    Raises:
-        ModelError: there is no such file; the message names the closest bundled model.
-    """
-    own = f"a {SUFFIX} file made by `liex train actions`"
-    return find_file(name, folder, SUFFIX, "action model", own)
 
 
 def bundled_action_models(folder: Path = MODELS) -> list[str]:

@@ -437,7 +437,7 @@ def _patches(
         if area < least_mm2:
             break
         own = _refitted(background, patch, floor, camera)
-        found.append(FlatGround(own, part, _enclosed(background, part, own, camera)))
+        found.append(FlatGround(own, part, _enclosed(background, part, own)))
     return found
 
 
@@ -451,7 +451,7 @@ def _refitted(background: NDArray[np.float32], patch: Mask, floor: Floor, camera
     return _in_pixels(own, middle, camera) if share > 0 else floor
 
 
-def _enclosed(background: NDArray[np.float32], patch: Mask, floor: Floor, camera: Camera) -> float:
+def _enclosed(background: NDArray[np.float32], patch: Mask, floor: Floor) -> float:
     """The share of a patch's outline just beyond which something rises above the floor.
 
     Outline along the image border is not enclosed.

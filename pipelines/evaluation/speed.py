@@ -40,7 +40,7 @@ from liex_lab.recordings import open_recording
 from liex_lab.recordings.frame import DepthFrame
 from liex_lab.recordings.recording import Recording
 from liex_lab.recordings.writer import ImageFolderWriter, McapDepthWriter, RecordingWriter
-from liex_lab.runtime.processes import own_python
+from liex_lab.runtime.processes import own_python, threads
 from liex_lab.runtime.progress import Progress, silent
 from liex_lab.scene.height_maps import Segmenter
 from liex_lab.sessions import Session
@@ -136,12 +136,9 @@ def isolated(job: str, *arguments: object, one_thread: bool = False) -> dict[str
 def two_cores() -> Iterator[int]:
     """A context in which kernels run on at most two cores; yields their number."""
     cores = min(2, numba.config.NUMBA_NUM_THREADS)
-    before = numba.get_num_threads()
-    numba.set_num_threads(cores)
-    try:
+    with threads(parallel=True):  # restores their number
+        numba.set_num_threads(cores)
         yield cores
-    finally:
-        numba.set_num_threads(before)
 
 
 @dataclass(frozen=True)

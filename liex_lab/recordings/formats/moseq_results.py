@@ -101,7 +101,7 @@ def _recording(path: Path, file: h5py.File, camera: Lens | None, fps: float | No
     problems = list(camera_file.problems)
     doubts: list[str] = []
     results = _Results(path, file, problems)
-    metadata = _metadata(path, file)
+    metadata = _metadata(file)
     results.check_first_frame(doubts)
     monotone = make_monotone(_times(path, file, results, camera_file, fps, problems, doubts))
     problems += [*metadata.problems, *filter(None, [monotone.problem])]
@@ -339,7 +339,7 @@ def _number(file: h5py.File, name: str) -> float | None:
     return float(found.reshape(())) if np.isfinite(found).all() else None
 
 
-def _metadata(path: Path, file: h5py.File) -> Metadata:
+def _metadata(file: h5py.File) -> Metadata:
     """The session's metadata.json, of which the file holds a copy."""
     document: dict[str, Any] = {}
     for group in ("metadata/acquisition", "metadata/extraction"):  # the latter before 0.1.3

@@ -291,7 +291,7 @@ class Making:
             ahead = np.array([np.cos(out), np.sin(out)])
             path = visiting(place + 105.0 * ahead, place - 6.0 * ahead, ((0.1, 0.55), (0.72, 0.95)))
             script = calm_script
-            still += places.house(arenas[0], place, out)
+            still += places.house(place, out)
         animals: list[Actor] = []
         for which in range(max(recipe.n_animals, recipe.n_arenas) if recipe.n_animals else 0):
             if which and recipe.n_arenas == 1:

@@ -463,11 +463,10 @@ def lid_bars(arena: SimulatedScene, share: float = 0.35) -> list[Mesh]:
     ]
 
 
-def house(arena: SimulatedScene, place: Array, yaw: float) -> list[Mesh]:
+def house(place: Array, yaw: float) -> list[Mesh]:
     """A shelter of 120 x 96 x 66 mm, open at one end.
 
     Args:
-        arena: the arena.
         place: (2,) its centre, mm, arena frame.
         yaw: direction of its exit, rad.
 

@@ -15,7 +15,8 @@ from liex_lab.pipelines.training.action_model import (
     train_actions,
 )
 
-from liex_lab.actions.storage import bundled_action_models, find_action_model, load_action_model
+from liex_lab.actions.storage import SUFFIX, bundled_action_models, load_action_model
+from liex_lab.catalog import MODELS
 from liex_lab.errors import LiexError
 from liex_lab.exchange import export
 from liex_lab.exchange.boris import read_boris_project
@@ -120,7 +121,7 @@ def test_the_bundled_models_know_their_words_and_are_small(
     animal: str, words: tuple[str, ...]
 ) -> None:
     assert animal in bundled_action_models()
-    assert find_action_model(animal).stat().st_size < 2_000_000
+    assert (MODELS / f"{animal}{SUFFIX}").stat().st_size < 2_000_000
     model = load_action_model(animal)
     assert model.skeleton == animal
     assert set(model.words) == {"", *words} == {"", *model.definitions}
