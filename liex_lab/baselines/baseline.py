@@ -46,7 +46,7 @@ from liex_lab.arrays import Array, NDArray
 from liex_lab.baselines import _kernels as kernels
 from liex_lab.body.pose import KinematicTree, forward_kinematics
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import MissingPackageError, ModelError
+from liex_lab.errors import MissingPackageError, ModelError, expecting
 from liex_lab.estimation.cascade import TrainingSet
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.training import ProgressCallback
@@ -319,17 +319,21 @@ class RegressionForest(Baseline):
         Raises:
             ModelError: the file does not contain two complete forests.
         """
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                where, pose = (
-                    Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
-                    for name in ("where", "pose")
-                )
+        with (
+            expecting(
+                ModelError,
+                f"{path} should be a whole regression forest",
+                *DAMAGE,
+                advice="remove it and train again",
+            ),
+            path.open("rb") as file,
+            np.load(file, allow_pickle=False) as archive,
+        ):
+            where, pose = (
+                Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
+                for name in ("where", "pose")
+            )
             return RegressionForest(skeleton, plan, where, pose)
-        except DAMAGE as error:
-            raise ModelError(
-                f"{path} is not a whole regression forest ({error}); remove it and train again"
-            ) from None
 
 
 def with_home_turn(skeleton: Skeleton, home_turn: tuple[float, ...]) -> Skeleton:
@@ -778,16 +782,17 @@ class Cnn(Baseline):
         import torch
 
         net = alexnet(3 * skeleton.n_joints, plan)
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                net.load_state_dict(
-                    {name: torch.from_numpy(archive[name]) for name in archive.files}
-                )
-        except DAMAGE as error:
-            message = str(error).splitlines()[0]
-            raise ModelError(
-                f"{path} does not hold the CNN's weights ({message}); remove it and train again"
-            ) from None
+        with (
+            expecting(
+                ModelError,
+                f"{path} should hold the CNN's weights",
+                *DAMAGE,
+                advice="remove it and train again",
+            ),
+            path.open("rb") as file,
+            np.load(file, allow_pickle=False) as archive,
+        ):
+            net.load_state_dict({name: torch.from_numpy(archive[name]) for name in archive.files})
         return Cnn(skeleton, net)
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from liex_lab.arrays import Array, NDArray
-from liex_lab.errors import LiexError, did_you_mean, how_to_install, refuse
+from liex_lab.errors import LiexError, did_you_mean, expecting, how_to_install, refuse
 from liex_lab.geometry import so3
 from liex_lab.runtime.text_files import read_toml
 
@@ -177,10 +177,8 @@ class Skeleton:
             near = did_you_mean(animal, names, "did you mean '{}'?")
             hint = near or f"choose one of {', '.join(names)}, or give a .toml file"
             raise LiexError(f"there is no skeleton '{animal}': {hint}")
-        try:
+        with expecting(LiexError, f"the skeleton {path} should be a TOML file", ValueError):
             table = read_toml(path)
-        except ValueError as error:
-            raise LiexError(f"the skeleton {path} is not a TOML file: {error}") from None
         return Skeleton.from_table(_with_mesh(table, path), str(path))
 
     @staticmethod

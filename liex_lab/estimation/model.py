@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from liex_lab.body.skeleton import Skeleton
-from liex_lab.errors import ModelError
+from liex_lab.errors import ModelError, expecting
 from liex_lab.estimation._feature_kernels import N_SCALARS
 from liex_lab.estimation._residual_kernels import N_FIT
 from liex_lab.estimation.cascade import Cascade
@@ -234,12 +234,13 @@ class Model:
             settler,
             facing,
         )
-        try:
+        with expecting(
+            ModelError,
+            f"{path} should hold a usable model",
+            *_DAMAGE,
+            advice="train it again or copy it again",
+        ):
             check_model(model)
-        except _DAMAGE as error:
-            raise ModelError(
-                f"{path} does not contain a usable model ({error}); train it again or copy it again"
-            ) from None
         return model
 
     def digest(self) -> str:

@@ -16,6 +16,7 @@ from liex_lab.errors import (
     RecordingError,
     UnknownCameraError,
     did_you_mean,
+    expecting,
     printable,
 )
 from liex_lab.optics.camera import Camera, Distortion, Lens
@@ -150,12 +151,10 @@ class CameraFile:
         """
         if not path.is_file():
             return CameraFile(path)
-        try:
+        with expecting(
+            RecordingError, f"{path} should be a TOML file", ValueError, advice="correct it"
+        ):
             document = read_toml(path)
-        except ValueError as error:
-            raise RecordingError(
-                f"{path} should be a TOML file, but it does not parse ({error}); correct it"
-            ) from None
         table = {key: value for key, value in document.items() if not isinstance(value, dict)}
         for name in ("camera", "recording"):
             if isinstance(document.get(name), dict):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from liex_lab.errors import RecordingError, UnknownTimesError
+from liex_lab.errors import RecordingError, UnknownTimesError, expecting
 from liex_lab.recordings.timestamps import (
     LIMIT_NS,
     PLAUSIBLE_HZ,
@@ -274,7 +274,11 @@ def read_stamps(
     Raises:
         RecordingError: there is no such column, its unit is unknown, or a cell is not a stamp.
     """
-    try:
+    with expecting(
+        RecordingError,
+        f"{path} should be a text file with one time stamp per line",
+        ValueError,
+    ):
         # between date and time
         # with a decimal comma
         separator, lines = split_lines(
@@ -283,10 +287,6 @@ def read_stamps(
             )
         )
         cells = split_cells(lines, separator)
-    except ValueError as error:
-        raise RecordingError(
-            f"{path} should be a text file with one time stamp per line, but {error}"
-        ) from None
     wanted = tuple(CSV_COLUMNS) if column is None else (column,)
     names = [[cell.lstrip("# ") for cell in row if cell != "#"] for row in cells]
     at = next((at for at, row in enumerate(names) if set(wanted) & set(row)), -1)

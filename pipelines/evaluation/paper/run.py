@@ -26,7 +26,7 @@ from liex_lab.actions.storage import load_action_model
 from liex_lab.baselines.baseline import CnnPlan, require_torch
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.catalog import bundled_models, kept_results_folder
-from liex_lab.errors import LiexError, MissingPackageError, PlanError
+from liex_lab.errors import LiexError, MissingPackageError, PlanError, expecting
 from liex_lab.estimation.estimator import PoseEstimator
 from liex_lab.estimation.method import method_of
 from liex_lab.evaluation.scores import plain
@@ -212,16 +212,18 @@ def kept_results(animal: str, folder: Path | None = None) -> dict[str, Any]:
     path = (folder or kept_results_folder()) / f"{animal}.json"
     if not path.is_file():
         return {"rows": {}, "sensitivity": {}}
-    try:
+    with expecting(
+        LiexError,
+        f"{path} should contain kept results of schema {SCHEMA} as JSON",
+        ValueError,
+        TypeError,
+        KeyError,
+        advice="restore it from the repository, or measure every row with --fresh",
+    ):
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["schema"] != SCHEMA:
             raise ValueError(f"its schema is {content['schema']}")
         return {part: dict(content[part]) for part in ("rows", "sensitivity")}
-    except (ValueError, TypeError, KeyError) as error:
-        raise LiexError(
-            f"{path} should contain kept results of schema {SCHEMA} as JSON, but does not "
-            f"({error}); restore it from the repository, or measure every row with --fresh"
-        ) from None
 
 
 def keep_results(folder: Path, results: Mapping[str, Any]) -> Path:

@@ -194,7 +194,7 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LiexError, match="has neither"):
         NyuReference.load(tmp_path)
     (tmp_path / REFERENCE_FILE).write_bytes(b"PK\x03\x04 not an archive")
-    with pytest.raises(LiexError, match="not a whole file of NYU labels"):
+    with pytest.raises(LiexError, match="should be a whole file of NYU labels"):
         NyuReference.load(tmp_path)
     np.savez(
         tmp_path / REFERENCE_FILE, groundtruth_uvd=labels(2), joint_names=np.array([*POINTS][::-1])

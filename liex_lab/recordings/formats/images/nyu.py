@@ -272,19 +272,27 @@ class NyuReference:
                 f"the NYU reference should be a folder with {REFERENCE_FILE} or {JOINT_FILE}, but "
                 f"{folder} has neither"
             )
-        try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as table:
-                truth = uvd_to_mm(table["groundtruth_uvd"])
-                found = {
-                    name.removesuffix("_uvd"): uvd_to_mm(table[name])
-                    for name in table.files
-                    if "_uvd" in name
-                }
-                names = [str(name) for name in table["joint_names"]]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise LiexError(
-                f"{path} is not a whole file of NYU labels ({error}); copy it again"
-            ) from None
+        with (
+            expecting(
+                LiexError,
+                f"{path} should be a whole file of NYU labels",
+                OSError,
+                ValueError,
+                KeyError,
+                EOFError,
+                zipfile.BadZipFile,
+                advice="copy it again",
+            ),
+            path.open("rb") as file,
+            np.load(file, allow_pickle=False) as table,
+        ):
+            truth = uvd_to_mm(table["groundtruth_uvd"])
+            found = {
+                name.removesuffix("_uvd"): uvd_to_mm(table[name])
+                for name in table.files
+                if "_uvd" in name
+            }
+            names = [str(name) for name in table["joint_names"]]
         if names != list(POINTS) or truth.shape[1:] != (len(POINTS), 3):
             raise LiexError(
                 f"{path} should label {', '.join(POINTS)}, in this order, but labels "

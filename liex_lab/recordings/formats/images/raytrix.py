@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from liex_lab.errors import RecordingError, did_you_mean
+from liex_lab.errors import RecordingError, did_you_mean, expecting
 from liex_lab.optics.camera import Camera, Lens
 from liex_lab.recordings.camera_file import CAMERA_FILE, CameraFile
 from liex_lab.recordings.formats.images.files import (
@@ -193,12 +193,10 @@ def read_profile(path: Path) -> Profile:
     Raises:
         RecordingError: the file is not TOML, names no known profile, or a value is invalid.
     """
-    try:
+    with expecting(
+        RecordingError, f"{path} should be a TOML file", ValueError, advice="correct it"
+    ):
         table = read_toml(path)
-    except ValueError as error:
-        raise RecordingError(
-            f"{path} should be a TOML file, but it does not parse ({error}); correct it"
-        ) from None
     shipped = shipped_profiles()
     name = table.pop("profile", None)
     if name is not None and name not in shipped:
