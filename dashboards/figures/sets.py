@@ -14,7 +14,7 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from liex_lab.behaviour.cohort import SUBJECT, unit_of
-from liex_lab.errors import SessionError, did_you_mean
+from liex_lab.errors import SessionError, did_you_mean, expecting
 from liex_lab.plan.study import references_first
 from liex_lab.runtime import durable, memory, text_files
 from liex_lab.runtime.progress import Progress, silent
@@ -232,7 +232,15 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
     Raises:
         SessionError: its files are missing or damaged.
     """
-    try:
+    with expecting(
+        SessionError,
+        f"{folder} should hold what `liex compare` writes",
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        advice="compare again",
+    ):
         table = text_files.read_harmless(
             folder / "sessions.csv", ("session_id", "individual", *SUBJECT)
         )
@@ -245,10 +253,6 @@ def read_comparison(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame, list[Sess
             stats = stats.rename(
                 columns={"n_units_first": "n_reference", "n_units_second": "n_group"}
             ).assign(group=ends[0], reference=ends[2])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SessionError(
-            f"{folder} should hold what `liex compare` writes, but: {error}; compare again"
-        ) from None
     return table, stats, [Session.open(p) for p in places if (p / "session.json").is_file()]
 
 

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from liex_lab.errors import MissingPackageError, StudyError, expecting, how_to_install
+from liex_lab.errors import StudyError, expecting, needing
 from liex_lab.plan import plans_folder
 from liex_lab.runtime import durable, text_files
 from liex_lab.runtime.processes import n_cores, worker_environment
@@ -369,12 +369,8 @@ def slurm_cluster(table: SlurmTable, scratch: str) -> Any:
     Raises:
         MissingPackageError: dask-jobqueue is not installed.
     """
-    try:
+    with needing("slurm", "measuring by workers on Slurm"):
         from dask_jobqueue import SLURMCluster
-    except ImportError:
-        raise MissingPackageError(
-            f"workers on Slurm need the package dask-jobqueue; {how_to_install('slurm')}"
-        ) from None
     from distributed import Security
 
     shared = Path(table.shared_folder).expanduser()
