@@ -327,7 +327,9 @@ INTERACTIONS: dict[str, Interaction] = {
         not_in=("mount",),
     ),
     "contact": Interaction(
-        "the skins are within {contact_mm:g} mm of each other", mutual=True, layered=True
+        "the skins are within {contact_mm:g} mm of each other, or one animal lies over the other",
+        mutual=True,
+        layered=True,
     ),
     "approach": Interaction(
         "the agent goes towards the target within 45 degrees, faster than {moving_mm_s:g} mm/s and "

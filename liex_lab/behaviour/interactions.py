@@ -446,6 +446,8 @@ class _Arena:
         """The mounts of two animals that their outline shows. Single poses beside another animal
         may be turned round: most of those in the time before decide.
         """
+        if self.outlines is None or self.animals[i].swims:
+            return
         time_s, limits, both = self.time_s, self.limits, self.observed(i, j, mutual=True)
         free = ~both & np.delete(self.known, [i, j], axis=0).all(axis=0)
         mask, times = self.lies_over & free, (segments(time_s, free), time_s, self.stop_s)
@@ -478,6 +480,12 @@ class _Arena:
     def _of_pair(self, i: int, j: int) -> Iterator[_Event]:
         """The interactions of two animals."""
         observable = [self.observed(i, j, mutual=mutual) for mutual in (False, True)]
+        covered = list(self._covered(i, j))
+        yield from covered
+        under = np.zeros(len(self.time_s), np.bool_)
+        for mount in covered:
+            under[mount.start : mount.stop] = True
+        observable[True] |= under
         numbers = [segments(self.time_s, one) for one in observable]
         ways = ((i, j), (j, i))
         margins = {way: self._margins(*way, numbers[False]) for way in ways}
@@ -485,8 +493,7 @@ class _Arena:
         done = {
             word: np.zeros(len(observable[True]), np.bool_) for word in WORDS
         }  # by either animal
-        if self.outlines is not None and not self.animals[i].swims:
-            yield from self._covered(i, j)
+        margins[ways[0]]["contact"][under] = 0.0  # animals that lie over each other touch
         for word in (word for word in WORDS if word in margins[ways[0]]):
             rule = WORDS[word]
             observed, number = observable[rule.mutual], numbers[rule.mutual]

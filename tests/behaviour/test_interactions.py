@@ -224,8 +224,10 @@ def test_a_mount_is_seen_by_the_outline_of_a_covered_animal():
     assert said(found) == [("a", "b", "mount")]
     assert found[["start_frame", "stop_frame", "score"]].to_numpy().tolist() == [[90, 150, 0.0]]
     assert found["directed"].all()
-    totals = find_interactions(np.arange(180) / HZ, animals, outlines=outlines).totals
-    own = totals.query("action == 'mount'").set_index("agent")
+    whole = find_interactions(np.arange(180) / HZ, animals, outlines=outlines)
+    touch = whole.events.query("action == 'contact' and start_frame <= 90 and stop_frame >= 150")
+    assert len(touch) == 1
+    own = whole.totals.query("action == 'mount'").set_index("agent")
     assert own["share"].to_dict() == pytest.approx({"a": 2.0 / 6.0, "b": 0.0})
     flipped = animals[0].joints_mm.copy()
     flipped[84:90] = flipped[84:90, ::-1]  # the last poses are turned round
