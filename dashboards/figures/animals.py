@@ -103,7 +103,7 @@ class SessionAnimal:
         empty = gaps[gaps["n_frames_missing"] > 0]  # the others are corrected timestamps
         return empty[["start_s", "stop_s"]].to_numpy(float)
 
-    @cached_property
+    @property  # not kept: those of a day are large
     def xy_mm(self) -> Array:
         """(n, 2) positions of the body's centre, mm, arena frame; NaN without a pose."""
         if self.kinematics is None:

@@ -312,7 +312,7 @@ def around_onsets(
     time_s = kinematics["time_s"].to_numpy(float)
     values = kinematics[column].to_numpy(float)
     grid = np.linspace(-BEFORE_S, AFTER_S, _STEPS)
-    usual_s = float(np.median(np.diff(time_s)))
+    usual_s = float(np.median(np.diff(time_s), overwrite_input=True))
     quartiles = np.full((3, _STEPS), np.nan)
     for part in blocks(_STEPS, 8):  # a day has tens of thousands of bouts
         wanted = own[:, None] + grid[part]
