@@ -449,8 +449,8 @@ class _Arena:
         if self.outlines is None or self.animals[i].swims:
             return
         time_s, limits, both = self.time_s, self.limits, self.observed(i, j, mutual=True)
-        free = ~both & np.delete(self.known, [i, j], axis=0).all(axis=0)
-        mask, times = self.lies_over & free, (segments(time_s, free), time_s, self.stop_s)
+        free = np.delete(self.known, [i, j], axis=0).all(axis=0)
+        mask, times = self.lies_over & ~both & free, (segments(time_s, free), time_s, self.stop_s)
         for start, stop in tidy(mask, free, *times, limits.merge_s, limits.min_s):
             before = time_s[:start] >= time_s[start] - limits.before_s
             rows = np.flatnonzero(both[:start] & before)
@@ -489,7 +489,7 @@ class _Arena:
         numbers = [segments(self.time_s, one) for one in observable]
         ways = ((i, j), (j, i))
         margins = {way: self._margins(*way, numbers[False]) for way in ways}
-        free = {way: observable[True].copy() for way in ways}
+        free = {way: observable[True] & ~under for way in ways}
         done = {
             word: np.zeros(len(observable[True]), np.bool_) for word in WORDS
         }  # by either animal
