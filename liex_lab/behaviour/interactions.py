@@ -489,7 +489,7 @@ class _Arena:
         numbers = [segments(self.time_s, one) for one in observable]
         ways = ((i, j), (j, i))
         margins = {way: self._margins(*way, numbers[False]) for way in ways}
-        free = {way: observable[True] & ~under for way in ways}
+        free = {way: np.where(under, False, observable[True]) for way in ways}
         done = {
             word: np.zeros(len(observable[True]), np.bool_) for word in WORDS
         }  # by either animal
