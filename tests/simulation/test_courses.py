@@ -69,5 +69,5 @@ def test_a_file_without_identities_is_refused_in_a_sentence(tmp_path: Path) -> N
     path = written(tmp_path / "pose_est_v5.h5")
     with h5py.File(path, "a") as file:
         del file["poseest/instance_embed_id"]
-    with pytest.raises(LiexError, match="is no pose file of JABS with identities"):
+    with pytest.raises(LiexError, match="should be a pose file of JABS with identities"):
         read_courses(path)
