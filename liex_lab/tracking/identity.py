@@ -97,7 +97,9 @@ def identify(
         # cost (m - 1, S, S) of going from one assignment to another
         transition = moves[:, states[:, None, :], states[None, :, :]].sum(axis=-1)
         path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
-        _through_gaps(observed[0][full], subjects[0], states[path], transition, states)
+        seconds, own = observed[0].seconds[full], _own_places(observed[0][full], states[path])
+        for t in np.flatnonzero(np.diff(seconds) > _GAP_S).tolist():
+            transition[t] = _passed(seconds, own, subjects[0], states[path], states, t, t + 1)
         bodies = np.stack([_misfit(one)[full] for one in observed])
         apart, weight = _independent(observed[0][full])
         shown = np.any([_fitting(one[full], subjects[0].length_mm) for one in observed], axis=0)
@@ -108,11 +110,11 @@ def identify(
         path, _ = _viterbi(transition, emission := sizes)
         if readings is not None:
             places = observed[0].centroid_mm[full, ::2, :2].astype(float)
-            read = readings.costs(observed[0].seconds[full], places, subjects[0].length_mm)
+            read = readings.costs(seconds, places, subjects[0].length_mm)
             path, emission, marked = _by_tags(readings, *read, transition, sizes, path, states)
         slots[full] = states[path]
         by = {"motion": np.zeros_like(sizes), "size": sizes, "rfid": emission}
-        crossings = _crossings(observed[0], full, transition, by, path, states)
+        crossings = _crossings(observed[0], subjects[0], full, transition, by, path, states)
     for start, stop in _follow(observed, subjects[0].length_mm, slots, known):
         met = [one for one in crossings if one.start < stop and start < one.stop]
         first, last = (
@@ -347,32 +349,44 @@ def _transitions(seconds, joints, error, costs, out):
                             out[t, i, j] = min(out[t, i, j], cost)
 
 
-def _through_gaps(
-    observed: Observations, subject: Subject, slots: Slots, transition: Array, states: Slots
-) -> None:
-    """Replace the costs (m - 1, S, S) of transitions over frames that do not show all animals.
+def _passed(
+    seconds: Array, own: Array, subject: Subject, slots: Slots, states: Slots, last: int, first: int
+) -> Array:
+    """Cost (S, S) of going from each assignment in frame `last` to each in a later one, `first`, by
+    the motion before and after.
 
     Both sides are continued by an integrated Ornstein-Uhlenbeck process, the smoother's model of
     motion: an animal that walks into another one is likely to walk on.
+
+    Args:
+        seconds: (m,) s.
+        own: (m, N, 2) mm, positions animal by animal.
+        subject: one of the animals.
+        slots: (m, N) the component of each.
+        states: (S, N) the assignments.
+        last: frame before.
+        first: frame after.
     """
     motion = TrackingParameters.of(subject.skeleton.name).motion
-    fade = motion.position_decay_s
-    seconds = observed.seconds
-    places = observed.centroid_mm[:, ::2, :2].astype(float)
-    own = np.take_along_axis(places, slots[..., None], axis=1)  # (m, N, 2) animal by animal
-    for t in np.flatnonzero(np.diff(seconds) > _GAP_S).tolist():
-        passed = seconds[t + 1] - seconds[t]
-        left = fade * (1.0 - np.exp(-passed / fade))
-        drift = passed - 2.0 * left + 0.5 * fade * (1.0 - np.exp(-2.0 * passed / fade))
-        variance = motion.position_variance[0] * subject.length_mm**2 * fade**2 * drift
-        ahead = own[t] + left * _velocity(own, seconds, t, -1)
-        back = own[t + 1] - left * _velocity(own, seconds, t + 1, 1)
-        sd2 = variance + (_PLACE_SHARE * subject.length_mm) ** 2
-        # cost (N, N) of the animal of each component becoming that of another one
-        cost = np.empty((len(slots[t]),) * 2)
-        off = (ahead[:, None] - own[t + 1]) ** 2 + (own[t][:, None] - back) ** 2
-        cost[np.ix_(slots[t], slots[t + 1])] = 0.25 * off.sum(axis=-1) / sd2
-        transition[t] = cost[states[:, None, :], states[None, :, :]].sum(axis=-1)
+    fade, passed = motion.position_decay_s, seconds[first] - seconds[last]
+    left = fade * (1.0 - np.exp(-passed / fade))
+    drift = passed - 2.0 * left + 0.5 * fade * (1.0 - np.exp(-2.0 * passed / fade))
+    variance = motion.position_variance[0] * subject.length_mm**2 * fade**2 * drift
+    ahead = own[last] + left * _velocity(own, seconds, last, -1)
+    back = own[first] - left * _velocity(own, seconds, first, 1)
+    sd2 = variance + (_PLACE_SHARE * subject.length_mm) ** 2
+    # cost (N, N) of the animal of each component becoming that of another one
+    cost = np.empty((len(slots[last]),) * 2)
+    off = (ahead[:, None] - own[first]) ** 2 + (own[last][:, None] - back) ** 2
+    cost[np.ix_(slots[last], slots[first])] = 0.25 * off.sum(axis=-1) / sd2
+    return np.asarray(cost[states[:, None, :], states[None, :, :]].sum(axis=-1))
+
+
+def _own_places(observed: Observations, slots: Slots) -> Array:
+    """Positions (m, N, 2) mm of the animals, whose components are slots (m, N)."""
+    return np.take_along_axis(
+        observed.centroid_mm[:, ::2, :2].astype(float), slots[..., None], axis=1
+    )
 
 
 def _velocity(own: Array, seconds: Array, t: int, side: int) -> Array:
@@ -474,6 +488,7 @@ def _viterbi(transition: Array, emission: Array) -> tuple[Slots, float]:
 
 def _crossings(
     observed: Observations,
+    subject: Subject,
     full: Slots,
     transition: Array,
     by: Mapping[str, Array],
@@ -484,7 +499,7 @@ def _crossings(
 
     `by` are emission costs (m, S), each with one more kind of evidence, by its name.
     """
-    seconds = observed.seconds
+    seconds, own = observed.seconds[full], _own_places(observed[full], states[path])
     steps = np.arange(len(full) - 1)
     others = transition[steps, path[:-1]] - transition[steps, path[:-1], path[1:]][:, None]
     others[steps, path[1:]] = np.inf
@@ -493,7 +508,7 @@ def _crossings(
     if not unclear.any():
         return ()
     at = np.flatnonzero(unclear)
-    apart = np.flatnonzero(seconds[full[at[1:]]] - seconds[full[at[:-1] + 1]] > _JOIN_S)
+    apart = np.flatnonzero(seconds[at[1:]] - seconds[at[:-1] + 1] > _JOIN_S)
     begins = at[np.append(0, apart + 1)]
     ends = at[np.append(apart, len(at) - 1)] + 1
     emission = np.stack([*by.values()], axis=1)  # (m, K, S)
@@ -507,6 +522,9 @@ def _crossings(
             cost = -np.logaddexp.reduce(-(cost[..., None] + transition[t]), axis=1)
             cost += emission[t + 1]
         cost += later[end]
+        if (np.diff(seconds[begin : end + 1]) <= _GAP_S).all():  # else it is in the transitions
+            on = _passed(seconds, own, subject, states[path], states, begin, end)[path[begin]]
+            cost += np.minimum(on - on.min(), _MOST_NATS)
         p = np.exp(cost.min(axis=1, keepdims=True) - cost)
         p_swaps = 1.0 - p[:, path[end]] / p.sum(axis=1)
         p_swap = p_swaps[-1]

@@ -10,6 +10,7 @@ from liex_lab.tracking.identity import (
     CERTAIN,
     UNCLEAR,
     OnlineIdentity,
+    _passed,
     covers,
     doubt,
     flag_unclear,
@@ -211,6 +212,19 @@ def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
     ]
     assert doubt([Crossing(0, 1, (0, 1), 1.0 - CERTAIN - 1e-9, "motion")]) == ""
     assert "70% certain" in doubt([unclear])
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_animals_that_run_past_each_other_are_likely_to_run_on(exchanged: bool) -> None:
+    x = 200.0 * (SECONDS - 1.5)
+    own = np.stack([np.stack([x, 0.0 * x], 1), np.stack([-x, 30.0 + 0.0 * x], 1)], 1)
+    slots = np.tile([0, 1], (90, 1))
+    if exchanged:  # the tracks turn back where they meet
+        own[45:], slots[45:] = own[45:, ::-1], [1, 0]
+    states = np.array([[0, 1], [1, 0]])
+    cost = _passed(SECONDS, own, SUBJECT, slots, states, 38, 52)
+    assert cost[0, 0] + 3.0 < cost[0, 1]
+    assert cost[0] == pytest.approx(cost[1, ::-1])
 
 
 def followed(seen: Observations, n_animals: int = 2) -> tuple[OnlineIdentity, np.ndarray]:
