@@ -64,8 +64,6 @@ _JOBS = {  # function: the module of `pipelines` that defines it
     "evaluate_statistics": "evaluation.statistics",
     "evaluate_sync": "evaluation.sync",
     "evaluate_cameras": "evaluation.cameras",
-    "evaluate_motion": "evaluation.motion",
-    "motion_in_short": "evaluation.motion",
     "evaluate_nyu": "evaluation.nyu",
     "hands_in_short": "evaluation.nyu",
     "search_noise": "evaluation.tracking",

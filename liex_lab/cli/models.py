@@ -663,36 +663,6 @@ def evaluate_nyu(
     return api.evaluate_nyu(reference, model=model, progress=progress)
 
 
-@benchmark("motion", lambda result: print_rows(api.motion_in_short(result)))
-def evaluate_motion(
-    reference: Annotated[
-        Path,
-        typer.Option(
-            "--reference",
-            metavar="NPZ",
-            help="Points of a real mouse: points_mm (n, P, 3), names (P,), optionally clip_frames.",
-        ),
-    ],
-    names: Annotated[
-        str,
-        typer.Option(
-            "--points", metavar="NAME,...", help="The five points from tail base to nose."
-        ),
-    ] = "TTI,Trunk,Spine,Neck,Nose",
-    up: Annotated[str, typer.Option("--up", help="Upward axis: x, y, z, -x, -y or -z.")] = "z",
-    rate_hz: Annotated[
-        float | None,
-        typer.Option("--rate", min=1.0, help="Frame rate; without it, speeds are not compared."),
-    ] = None,
-    *,
-    progress: Progress,
-) -> Result:
-    """Compare posture and movement of a real and the virtual mouse by quantiles."""
-    return api.evaluate_motion(
-        reference, names=names.split(","), up=up, rate_hz=rate_hz, progress=progress
-    )
-
-
 @benchmark("reference")
 def evaluate_reference(
     session: SessionPath,
