@@ -498,7 +498,7 @@ class Prepared:
         self,
         writer: SessionWriter,
         observed: observations.Observations | None = None,
-        crossings: Sequence[Crossing] | None = None,
+        crossings: Sequence[Crossing] = (),
         covering: NDArray[np.bool_] | None = None,
     ) -> None:
         """Make the track of the animal and the verdict on it, and pass them to the writer.
@@ -506,8 +506,8 @@ class Prepared:
         Args:
             writer: has all frames.
             observed: the observations of this animal; None uses those that the writer has.
-            crossings: in which it may have been exchanged with another one; None if it is alone.
-            covering: (n,) where it may lie over another one.
+            crossings: in which it may have been exchanged with another one.
+            covering: (n,) where it may lie over another one; None if it is alone.
         """
         began = time.perf_counter()
         verdict = make_track(writer, self.fitted, observed, crossings, covering)
@@ -597,9 +597,9 @@ def read_ahead(opened: Recording, first: int) -> Generator[list[frame.DepthFrame
 def make_track(
     writer: SessionWriter,
     fitted: Fitted,
-    observed: observations.Observations | None = None,
-    crossings: Sequence[Crossing] | None = None,
-    covering: NDArray[np.bool_] | None = None,
+    observed: observations.Observations | None,
+    crossings: Sequence[Crossing],
+    covering: NDArray[np.bool_] | None,
 ) -> Verdict:
     """Make the track of a session whose frames have all been measured, and pass it to the writer.
 
@@ -607,8 +607,8 @@ def make_track(
         writer: has all frames.
         fitted: plan, recording and tracker.
         observed: the observations of the animal; None uses those that the writer has.
-        crossings: in which it may have been exchanged with another one; None if it is alone.
-        covering: (n,) where it may lie over another one.
+        crossings: in which it may have been exchanged with another one.
+        covering: (n,) where it may lie over another one; None if it is alone.
 
     Returns:
         The verdict on the session.
@@ -616,7 +616,7 @@ def make_track(
     tracker = fitted.tracker
     whole = observed or writer.observations(observations.Observations)
     tracked = tracker.track(whole, allocate=writer.allocate)
-    if crossings is not None:
+    if covering is not None:
         tracked = replace(tracked, crossings=tuple(crossings))
         identity.flag_unclear(tracked, covering)
     subject = tracker.subject

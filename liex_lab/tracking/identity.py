@@ -272,7 +272,7 @@ def covers(own: Sequence[Observations], length_mm: float) -> NDArray[np.bool_]:
     return out & fits
 
 
-def flag_unclear(tracked: Tracked, covering: NDArray[np.bool_] | None = None) -> None:
+def flag_unclear(tracked: Tracked, covering: NDArray[np.bool_]) -> None:
     """Flag the poses of a track in place: in crossings unclear where it is not clear whose they are
     or which end is the head; doubtful in those that begin before the animal stood apart.
 
@@ -281,7 +281,7 @@ def flag_unclear(tracked: Tracked, covering: NDArray[np.bool_] | None = None) ->
         covering: (n,) where it may lie over another animal, see `covers`; unclear unless reviewed.
     """
     first = int(np.argmax(tracked.track.posed))
-    covering = np.zeros(len(tracked.track.flag), np.bool_) if covering is None else covering.copy()
+    covering = covering.copy()
     for one in tracked.crossings or ():
         covering[one.start : one.stop] &= not one.reviewed_by
     flags = tracked.track.flag

@@ -61,7 +61,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for one in zip(subjects, observed, strict=True)
     ]
     for one in tracked:
-        flag_unclear(one)
+        flag_unclear(one, np.zeros(N, np.bool_))
     names = ["animal1", "animal2"]
     people = [
         Individual.of_track(*one) for one in zip(names, (t.track for t in tracked), strict=True)

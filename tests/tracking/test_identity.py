@@ -204,7 +204,7 @@ def test_poses_in_an_unclear_crossing_are_not_trusted() -> None:
         track_whole(SUBJECT, told(SECONDS, WALKS[0])), crossings=(from_the_start, unclear, clear)
     )
     tracked.track.p_flip[35:50] = 0.2  # the head is not clear: it counts in contact alone
-    flag_unclear(tracked)
+    flag_unclear(tracked, np.zeros(len(SECONDS), np.bool_))
     assert np.flatnonzero(tracked.track.flag == "doubtful").tolist() == [*range(4)]
     assert np.flatnonzero(tracked.track.flag == "unclear").tolist() == [
         *range(10, 20),
