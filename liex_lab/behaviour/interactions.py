@@ -65,16 +65,16 @@ class Individual:
         skeleton: a chain of J joints.
         joints_mm: (n, J, 3) arena frame; NaN without a pose.
         trusted: (n,) bool, whether the pose was measured and nothing contradicts it.
-        clear: (n,) bool, whether it is clear that this is the animal; None if it always is.
-        ends: (n,) bool, whether it is clear which end is the head; None if it always is.
+        clear: (n,) bool, whether it is clear that this is the animal.
+        ends: (n,) bool, whether it is clear which end is the head.
     """
 
     name: str
     skeleton: Skeleton
     joints_mm: Array
     trusted: Mask
-    clear: Mask | None = None
-    ends: Mask | None = None
+    clear: Mask
+    ends: Mask
 
     @staticmethod
     def of_track(name: str, track: Track) -> "Individual":
@@ -95,10 +95,8 @@ class Individual:
             self.skeleton,
             joints.reshape(self.joints_mm.shape),
             known | whole_gaps(time_s, known, most_s),
-            *(
-                (np.ones_like(known) if one is None else one)[last]
-                for one in (self.clear, self.ends)
-            ),
+            self.clear[last],
+            self.ends[last],
         )
 
 

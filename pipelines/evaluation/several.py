@@ -147,8 +147,10 @@ def _counts(
     plan = plan_of(animal).with_settings([f"animal.count={len(actors)}"])
     limits, unit = plan.interactions, KINDS[animal].unit
     deeds: list[Deed] = [*acts, *_of_gaps(gaps, time_s, limits)]
-    true = [
-        Individual(str(k), actor.surface.skeleton, actor.joints, actor.present)
+    true = [  # whose names and ends are always clear
+        Individual(
+            str(k), actor.surface.skeleton, actor.joints, actor.present, *np.ones((2, n), np.bool_)
+        )
         for k, actor in enumerate(actors)
     ]
     exact = _deeds(

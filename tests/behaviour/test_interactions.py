@@ -31,7 +31,7 @@ def mouse(name: str, path: Path, seconds: float = 6.0, hz: float = HZ) -> Indivi
     ahead = np.stack([np.cos(way), np.sin(way), np.zeros(len(way))], axis=-1)
     start = np.stack([x, y, np.full(len(x), 15.0)], axis=-1)
     joints = start[:, None] + reach[:, None] * ahead[:, None]
-    return Individual(name, MOUSE, joints, np.ones(len(joints), np.bool_))
+    return Individual(name, MOUSE, joints, *[np.ones(len(joints), np.bool_)] * 3)
 
 
 def still(x: float, y: float, way: float = 0.0) -> Path:
@@ -264,7 +264,7 @@ def test_distances_of_skins_agree_with_those_of_the_meshes():
         )
         a, b = (
             interactions._Course.of(
-                Individual("", MOUSE, np.repeat(one[None], 2, 0), np.ones(2, bool)),
+                Individual("", MOUSE, np.repeat(one[None], 2, 0), *[np.ones(2, bool)] * 3),
                 np.array([0.0, 0.1]),
                 limits,
             )

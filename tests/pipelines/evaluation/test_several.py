@@ -21,7 +21,7 @@ def test_two_animals_near_the_truth_score_high_and_an_exchange_is_a_swap(monkeyp
             joints[0][150:], joints[1][150:] = joints[1][150:], joints[0][150:].copy()
         trusted = np.ones(len(recording), np.bool_)
         animals = [
-            Individual(f"animal{k}", recording.skeleton, T @ one, trusted)
+            Individual(f"animal{k}", recording.skeleton, T @ one, trusted, trusted, trusted)
             for k, one in enumerate(joints, 1)
         ]
         found = find_interactions((recording.times_ns - recording.times_ns[0]) * 1e-9, animals)
