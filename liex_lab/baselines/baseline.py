@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 
 
 # exceptions that a broken .npz raises
-DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile)
+_DAMAGE = (OSError, ValueError, LookupError, EOFError, RuntimeError, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True)
@@ -311,29 +311,6 @@ class RegressionForest(Baseline):
         packed = io.BytesIO()
         np.savez_compressed(packed, **arrays)
         return packed.getvalue()
-
-    @staticmethod
-    def load(path: Path, skeleton: Skeleton, plan: ForestPlan) -> RegressionForest:
-        """Read a trained pair of forests from a file with the bytes of `to_bytes`.
-
-        Raises:
-            ModelError: the file does not contain two complete forests.
-        """
-        with (
-            expecting(
-                ModelError,
-                f"{path} should be a whole regression forest",
-                *DAMAGE,
-                advice="remove it and train again",
-            ),
-            path.open("rb") as file,
-            np.load(file, allow_pickle=False) as archive,
-        ):
-            where, pose = (
-                Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
-                for name in ("where", "pose")
-            )
-            return RegressionForest(skeleton, plan, where, pose)
 
 
 def with_home_turn(skeleton: Skeleton, home_turn: tuple[float, ...]) -> Skeleton:
@@ -772,28 +749,41 @@ class Cnn(Baseline):
         np.savez(packed, **{name: values.numpy() for name, values in self.net.state_dict().items()})
         return packed.getvalue()
 
-    @staticmethod
-    def load(path: Path, skeleton: Skeleton, plan: CnnPlan) -> Cnn:
-        """Read the weights of a trained network from a file with the bytes of `to_bytes`.
 
-        Raises:
-            ModelError: the file is damaged, or its weights do not fit the plan.
-        """
-        import torch
+def load_baseline(
+    path: Path, skeleton: Skeleton, plan: ForestPlan | CnnPlan
+) -> RegressionForest | Cnn:
+    """Read a trained baseline from a file with the bytes of its `to_bytes`.
 
-        net = alexnet(3 * skeleton.n_joints, plan)
-        with (
-            expecting(
-                ModelError,
-                f"{path} should hold the CNN's weights",
-                *DAMAGE,
-                advice="remove it and train again",
-            ),
-            path.open("rb") as file,
-            np.load(file, allow_pickle=False) as archive,
-        ):
+    Args:
+        path: the file.
+        skeleton: the animal's skeleton.
+        plan: the parameters that it was trained with.
+
+    Raises:
+        ModelError: the file is damaged, or was trained with another plan.
+    """
+    with (
+        expecting(
+            ModelError,
+            f"{path} should hold a whole baseline",
+            *_DAMAGE,
+            advice="remove it and train again",
+        ),
+        path.open("rb") as file,
+        np.load(file, allow_pickle=False) as archive,
+    ):
+        if isinstance(plan, CnnPlan):
+            import torch
+
+            net = alexnet(3 * skeleton.n_joints, plan)
             net.load_state_dict({name: torch.from_numpy(archive[name]) for name in archive.files})
-        return Cnn(skeleton, net)
+            return Cnn(skeleton, net)
+        where, pose = (
+            Forest(*(archive[f"{name}_{part}"] for part in ("nodes", "roots", "leaves")))
+            for name in ("where", "pose")
+        )
+        return RegressionForest(skeleton, plan, where, pose)
 
 
 def _channels(patches: NDArray[np.float32]) -> torch.Tensor:

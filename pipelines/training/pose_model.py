@@ -621,9 +621,7 @@ def trained_baseline(animal: str, variant: str, progress: Progress = silent) -> 
     path = cached_baseline(variant, skeleton, training)
     if not path.is_file():
         train_baseline(variant, skeleton, training, path, progress)
-    if isinstance(training.plan, baseline.CnnPlan):
-        return baseline.Cnn.load(path, skeleton, training.plan)
-    return baseline.RegressionForest.load(path, skeleton, training.plan)
+    return baseline.load_baseline(path, skeleton, training.plan)
 
 
 def cached_baseline(variant: str, skeleton: Skeleton, training: Training) -> Path:

@@ -87,7 +87,7 @@ def test_a_joint_in_the_middle_of_the_square_at_the_mean_depth_is_zero_and_neare
 if find_spec("torch"):  # an extra that the tests do without: see `cnn` in pyproject.toml
 
     def test_a_small_network_learns_and_is_the_same_after_writing(tmp_path):
-        from liex_lab.baselines.baseline import Cnn, CnnPlan, train_cnn
+        from liex_lab.baselines.baseline import Cnn, CnnPlan, load_baseline, train_cnn
 
         plan = CnnPlan(width=0.125, connected=32, epochs=10)
         toy = toy_mice(64, 6)
@@ -104,5 +104,6 @@ if find_spec("torch"):  # an extra that the tests do without: see `cnn` in pypro
         assert np.median(off) < 25.0
         np.testing.assert_allclose(nets[1].joints(heights, crop_cameras), said, atol=1.0)
         (tmp_path / "net.npz").write_bytes(nets[0].to_bytes())
-        again = Cnn.load(tmp_path / "net.npz", toy.skeleton, plan)
+        again = load_baseline(tmp_path / "net.npz", toy.skeleton, plan)
+        assert isinstance(again, Cnn)
         np.testing.assert_array_equal(again.joints(heights, crop_cameras), said)

@@ -14,6 +14,7 @@ from liex_lab.baselines.baseline import (
     RegressionForest,
     coordinates,
     levers,
+    load_baseline,
     train_forests,
     with_home_turn,
 )
@@ -147,7 +148,7 @@ def test_a_file_gives_the_forest_back_and_a_damaged_one_is_refused(grown, tmp_pa
     path, toy = tmp_path / "rf.npz", toy_mice(5, 4)
     toy.depths[1] = FLOOR.depth(*toy.depths.shape[:0:-1])  # no animal
     path.write_bytes(grown.to_bytes())
-    again = RegressionForest.load(path, grown.skeleton, grown.plan)
+    again = load_baseline(path, grown.skeleton, grown.plan)
     np.testing.assert_array_equal(
         again.estimate(toy.depths, SCENE, 1.0).joints, grown.estimate(toy.depths, SCENE, 1.0).joints
     )
@@ -156,7 +157,7 @@ def test_a_file_gives_the_forest_back_and_a_damaged_one_is_refused(grown, tmp_pa
     assert np.isnan(found.joints[1]).all()
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(ModelError, match="train again"):
-        RegressionForest.load(path, grown.skeleton, grown.plan)
+        load_baseline(path, grown.skeleton, grown.plan)
 
 
 @pytest.mark.nightly
