@@ -73,12 +73,11 @@ class Saver:
     Args:
         correct: adds corrections to the session in a folder, or undoes some; called with the
             folder, the corrections, and `undo` and `author`.
-        report: makes the report of the session in a folder again; None if `correct` does.
+        report: makes the report of the session in a folder again.
         calm_s: time without corrections before a session's report is made again, s.
     """
 
-    # time without a correction before the report is made again
-    def __init__(self, correct: Correct, report: Report | None = None, calm_s: float = 3.0) -> None:
+    def __init__(self, correct: Correct, report: Report, calm_s: float = 3.0) -> None:
         self._correct = correct
         self._report = report
         self._calm_s = calm_s
@@ -147,7 +146,7 @@ class Saver:
             batch, report = self._next()
             if batch:
                 self._save(batch)
-            elif report is not None and self._report is not None:
+            elif report is not None:
                 with suppress(LiexError, OSError):  # `liex report` shows the error
                     self._report(report)
                 with self._changed:
@@ -203,7 +202,7 @@ class Saver:
                 ticket.state = state
                 ticket.message = reason or ticket.message
                 self._waiting.remove(ticket)
-            if state == SAVED and self._report is not None:
+            if state == SAVED:
                 self._reports[batch[0].folder] = time.monotonic() + self._calm_s
             self._changed.notify_all()
 
@@ -214,16 +213,16 @@ class Clerk:
 
     Attributes:
         desk: finds the desk of a session by its key.
-        saver: saves the corrections; None accepts none.
+        saver: saves the corrections.
     """
 
     desk: Callable[[str], Desk]
-    saver: Saver | None
+    saver: Saver
 
     def about(self, key: str) -> dict[str, Any]:
         """Facts about the session `key`; for a session without poses, the reason and no n."""
         try:
-            return {**self.desk(key).about(), "may_correct": self.saver is not None}
+            return self.desk(key).about()
         except LiexError as error:
             return {"message": str(error)}
 
@@ -249,8 +248,6 @@ class Clerk:
         Raises:
             SessionError: there is no such session.
         """
-        if self.saver is None:
-            return {"unsaved": 0, "report_old": False, "tickets": {}, "log": []}
         desk = self.desk(key)
         unsaved, old = self.saver.busy(desk.session.path)
         return {
@@ -277,8 +274,8 @@ class Clerk:
         """
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
         saver = self.saver
-        if saver is None or not isinstance(asked, dict):
-            return {"message": "no correction is taken here"}, 403 if saver is None else 400
+        if not isinstance(asked, dict):
+            return {"message": "no correction is taken here"}, 400
         desk = self.desk(key)
         folder = desk.session.path
         author = _text(asked, "by")

@@ -39,12 +39,10 @@ class Desk(Footage):
     Args:
         session: the opened session.
         images: the depth images.
-        suggest: finds the stretches whose actions are least certain; None finds none.
+        suggest: finds the stretches whose actions are least certain.
     """
 
-    def __init__(
-        self, session: Session, images: DepthImages, suggest: Suggest | None = None
-    ) -> None:
+    def __init__(self, session: Session, images: DepthImages, suggest: Suggest) -> None:
         super().__init__(session, images)
         self._suggest = suggest
 
@@ -141,7 +139,7 @@ class Desk(Footage):
     def suggested(self) -> list[Stretch]:
         """The stretches whose actions are least certain; none without a model."""
         try:
-            rows = [] if self._suggest is None else records(self._suggest(self.session.path))
+            rows = records(self._suggest(self.session.path))
         except LiexError:  # no recogniser for this animal
             rows = []
         return [

@@ -86,7 +86,6 @@ class Pages:
         data: the study.
         desk: finds a session's data by its key.
         show_replay: opens the replay of a .rrd at a time (s); None only shows the command.
-        may_correct: whether corrections are saved.
         of_recordings: whether regions can be drawn for recordings without results.
         measuring: lists, examines and measures recordings, see `make_app`; None measures none.
     """
@@ -94,9 +93,8 @@ class Pages:
     data: StudyData
     desk: Callable[[str], Desk]
     show_replay: ShowReplay | None
-    may_correct: bool
     of_recordings: bool
-    measuring: Any = None
+    measuring: Any
 
     def table(self, name: str, **how: Any) -> Markup:
         """A table as HTML, by its name; see `tables.find` and `tables.fill`."""
@@ -198,7 +196,7 @@ class Pages:
             at_s=_moment(),
             steps=_STEPS,
             may_show=self.show_replay is not None,
-            sentences=correcting.SENTENCES if self.may_correct else (),
+            sentences=correcting.SENTENCES,
             modules=sorted(
                 path.name for path in (Path(__file__).parent / "assets").glob("desk*.mjs")
             ),

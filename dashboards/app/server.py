@@ -26,7 +26,6 @@ from waitress.server import create_server
 from werkzeug.exceptions import HTTPException
 
 from liex_lab.errors import LiexError, SessionError, printable
-from liex_lab.optics.camera import Camera
 from liex_lab.runtime.processes import Ended
 from liex_lab.scene.background import usual_depth
 from liex_lab.sessions import Session
@@ -45,7 +44,7 @@ class Scenes:
     Attributes:
         data: the study.
         images: the depth images.
-        regions: reads and writes the regions of recordings, see `make_app`; None writes none.
+        regions: reads and writes the regions of recordings, see `make_app`.
     """
 
     data: StudyData
@@ -59,11 +58,8 @@ class Scenes:
             LiexError: there is no such recording, or it cannot be read.
         """
         session = self._session(key)
-        facts: dict[str, Any] = {"may_save": self.regions is not None, "places": []}
-        facts["region"] = None
-        if self.regions is not None:
-            facts |= self.regions.about(key, session)
-        camera = self._whole(key)[1] if session is None else session.camera
+        facts = self.regions.about(key, session)
+        camera = self.regions.depth_image(key)[1] if session is None else session.camera
         marks = [] if session is None else scene_marks(session)
         found = [
             {"kind": mark.kind, "label": mark.label, "points": mark.points_px.round(1).tolist()}
@@ -81,8 +77,8 @@ class Scenes:
             LiexError: the region is invalid, or cannot be saved.
         """
         asked = request.get_json(silent=True)  # another site's form cannot send JSON
-        if self.regions is None or not isinstance(asked, dict):
-            return {"message": "no region is saved here"}, 403 if self.regions is None else 400
+        if not isinstance(asked, dict):
+            return {"message": "no region is saved here"}, 400
         place = str(asked.get("place"))[:40]
         corners, was = asked.get("corners"), asked.get("was")
         if isinstance(zone := asked.get("zone"), dict):
@@ -101,7 +97,7 @@ class Scenes:
         """
         session = self._session(key)
         if session is None or request.args.get("of") == "recording":
-            depth = self._whole(key)[0]
+            depth = self.regions.depth_image(key)[0]
         else:
             depth = self._usual(session)
         return Response(png(_shaded(depth)), mimetype="image/png")
@@ -129,11 +125,6 @@ class Scenes:
         depths = [self.images.depth(session, int(row)) for row in rows]
         empty = np.zeros((session.camera.height, session.camera.width), np.uint16)
         return usual_depth(np.stack([one for one in depths if one is not None] or [empty]))
-
-    def _whole(self, key: str) -> tuple[NDArray[np.uint16], Camera]:
-        if self.regions is None:
-            raise SessionError(f"{key} was not measured yet, so there is no image of it")
-        return self.regions.depth_image(key)
 
 
 def scene_svg(session: Session, depth: NDArray[np.uint16]) -> str:
@@ -173,15 +164,15 @@ _POLICY = (
 def make_app(
     data: StudyData,
     *,
-    token: str = "",
-    alone: bool = True,
-    show_replay: pages.ShowReplay | None = None,
-    correct: corrections.Correct | None = None,
-    report: corrections.Report | None = None,
-    suggest: Suggest | None = None,
-    reviews: Path | None = None,
-    regions: Any = None,
-    measuring: Any = None,
+    token: str,
+    alone: bool,
+    show_replay: pages.ShowReplay | None,
+    correct: corrections.Correct,
+    report: corrections.Report,
+    suggest: Suggest,
+    reviews: Path,
+    regions: Any,
+    measuring: Any,
 ) -> Flask:
     """Make the dashboard of a study; `serve` serves it.
 
@@ -191,17 +182,15 @@ def make_app(
         alone: only accept requests from this machine.
         show_replay: opens the replay of a .rrd at a time (s), or raises LiexError; None only shows
             the command.
-        correct: adds corrections to the session in a folder, or undoes some; None makes the pages
-            read-only.
-        report: makes the report of the session in a folder again after a correction; None if
-            `correct` does.
-        suggest: finds the stretches of a session whose actions are least certain; None finds none.
-        reviews: folder of blinded reviews, created with the first one; None accepts none.
+        correct: adds corrections to the session in a folder, or undoes some.
+        report: makes the report of the session in a folder again after a correction.
+        suggest: finds the stretches of a session whose actions are least certain.
+        reviews: folder of blinded reviews, created with the first one.
         regions: reads and writes the regions of recordings: `of_recordings`, whether recordings
             without results are available; `about(key, session)`, facts about a region;
             `save(key, session, place, corners, was)`, which saves corners (px) in a place that
             contained `was`; and `depth_image(key)`, the usual depth (mm) of every pixel, and the
-            camera. None writes none.
+            camera.
         measuring: lists and measures recordings below a folder: `listed(at)`, `start(verb, at,
             plan)`, `stop()` and `state()`. None measures none.
     """
@@ -222,13 +211,13 @@ def make_app(
         session = data.session(key)
         return kept.get(key, id(session), partial(Desk, session, images, suggest))
 
-    saver = corrections.Saver(correct, report) if correct is not None else None
-    app.extensions[_SAVER] = saver
-    of_recordings = regions is not None and regions.of_recordings
-    shown = pages.Pages(data, desk_of, show_replay, saver is not None, of_recordings, measuring)
+    app.extensions[_SAVER] = saver = corrections.Saver(correct, report)
+    shown = pages.Pages(data, desk_of, show_replay, regions.of_recordings, measuring)
     pages.add_handlers(app, shown)
     clerk = corrections.Clerk(desk_of, saver)
     scenes = Scenes(data, images, regions)
+    raters = corrections.Reviews(data, desk_of, reviews)
+    clip = "GET /reviews/<path:name>/clip/<int:number>"
     views: dict[str, Callable[..., Any]] = {
         "GET /": shown.sessions,
         "POST /refresh": shown.refresh,
@@ -267,20 +256,15 @@ def make_app(
         "GET /region/<path:key>/image.png": scenes.image,
         "GET /region/<path:key>/scene.svg": scenes.scene,
         "POST /region/<path:key>/save": scenes.save,
+        "GET /reviews": raters.names,
+        "POST /reviews": raters.begin,
+        "GET /reviews/<path:name>/state": raters.state,
+        "POST /reviews/<path:name>/answer": raters.answer,
+        f"{clip}/about": raters.about,
+        f"{clip}/times": raters.times,
+        f"{clip}/rows/<int:start>/<int:end>": raters.rows,
+        f"{clip}/frame/<int:row>.png": raters.frame,
     }
-    if reviews is not None:
-        raters = corrections.Reviews(data, desk_of, reviews)
-        clip = "GET /reviews/<path:name>/clip/<int:number>"
-        views |= {
-            "GET /reviews": raters.names,
-            "POST /reviews": raters.begin,
-            "GET /reviews/<path:name>/state": raters.state,
-            "POST /reviews/<path:name>/answer": raters.answer,
-            f"{clip}/about": raters.about,
-            f"{clip}/times": raters.times,
-            f"{clip}/rows/<int:start>/<int:end>": raters.rows,
-            f"{clip}/frame/<int:row>.png": raters.frame,
-        }
     for rule, view in views.items():
         method, path = rule.split(" ")
         app.add_url_rule(path, rule.replace(".", "-"), view, methods=[method])
@@ -332,9 +316,7 @@ def serve(app: Flask, host: str, port: int, report: Callable[[int], object]) -> 
             raise
     finally:
         server.task_dispatcher.shutdown()
-        saver: corrections.Saver | None = app.extensions[_SAVER]
-        if saver is not None:
-            saver.finish()
+        app.extensions[_SAVER].finish()
 
 
 def address(host: str, port: int, token: str) -> str:

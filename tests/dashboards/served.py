@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+from flask import Flask
 from liex_lab.dashboards.app.data import StudyData
 from liex_lab.dashboards.app.server import make_app, serve
 from liex_lab.pipelines.bench import Bench
@@ -13,6 +15,22 @@ from liex_lab.pipelines.region_config import StatedRegions
 from liex_lab.pipelines.study.run import list_sessions
 
 from liex_lab.api import correct_session
+
+
+def app_of(data: StudyData, place: Path = Path("nowhere"), **more: Any) -> Flask:
+    """The dashboard of a study or a folder; reports are not made again."""
+    parts = {
+        "token": "",
+        "alone": True,
+        "show_replay": None,
+        "correct": partial(correct_session, report=False),
+        "report": lambda folder: None,
+        "suggest": lambda folder: pd.DataFrame(),
+        "reviews": (place if place.is_dir() else place.parent) / "reviews",
+        "regions": StatedRegions(place),
+        "measuring": None,
+    }
+    return make_app(data, **(parts | more))
 
 
 class Served:
@@ -24,12 +42,10 @@ class Served:
         place = study if study.is_dir() else study.parent
         data = StudyData(*list_sessions(study))
         data.warm()
-        app = make_app(
+        app = app_of(
             data,
+            study,
             show_replay=lambda replay, at_s: self.asked.append((replay, at_s)),
-            correct=partial(correct_session, report=False),
-            reviews=place / "reviews",
-            regions=StatedRegions(study),
             measuring=Bench(place.resolve()),
             **more,
         )

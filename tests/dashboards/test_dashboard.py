@@ -31,7 +31,6 @@ from liex_lab.dashboards.app.server import (
     MOST_BYTES,
     address,
     guard,
-    make_app,
     serve,
 )
 from liex_lab.pipelines.study.run import list_sessions
@@ -43,6 +42,7 @@ from liex_lab.errors import LiexError, SessionError
 from liex_lab.sessions import Session
 from liex_lab.sessions.verdict import Entry
 from tests.dashboards import copies
+from tests.dashboards.served import app_of
 
 KEY = "sub-m003_ses-01"
 
@@ -137,7 +137,7 @@ def test_ethograms_and_budgets_name_a_group_once_and_every_colour_has_a_meaning(
     shares = {"walk_share": 0.5, "unlabelled_share": 0.3, "sit_share": 0.2}
     monkeypatch.setattr(shown, "ethograms", lambda keys: ones)
     monkeypatch.setattr(shown, "collected", lambda: pd.DataFrame({"key": list(ones)} | shares))
-    with make_app(shown).test_request_context("/ethograms"):
+    with app_of(shown).test_request_context("/ethograms"):
         page = ethogram_rows(shown)
     rows = page["entries"]
     assert [row["group"] for row in rows] == ["drug", "", "vehicle"]
@@ -175,7 +175,7 @@ def test_no_two_actions_share_a_colour() -> None:
 
 
 def test_names_are_text_on_every_page(data: StudyData) -> None:
-    browser = make_app(data).test_client()
+    browser = app_of(data).test_client()
     for path in ("/", "/ethograms", "/groups?measure=mean_speed_mm_s", f"/session/{KEY}"):
         page = browser.get(path).text
         assert "drug&lt;/b&gt; %{y}" in page
@@ -217,7 +217,7 @@ def test_a_table_in_a_spreadsheet_computes_nothing_and_is_whole() -> None:
 
 
 def test_every_table_of_a_session_can_be_had(data: StudyData) -> None:
-    browser = make_app(data).test_client()
+    browser = app_of(data).test_client()
     session = data.session(KEY)
     for name in tables.session_tables(data, KEY):
         answer = browser.get(f"/session-csv/{KEY}/{name}.csv")
@@ -243,7 +243,7 @@ def test_steps_go_to_the_next_frame_bout_and_flag(data: StudyData) -> None:
 
 
 def test_this_machine_alone_may_ask_and_no_other_site(data: StudyData) -> None:
-    browser = make_app(data).test_client()
+    browser = app_of(data).test_client()
     assert browser.get("/", headers={"Host": "127.0.0.1:8050"}).status_code == 200
     assert browser.get("/", headers={"Host": "evil.example:8050"}).status_code == 403
     sent = {"Host": "127.0.0.1:8050", "Origin": "http://evil.example"}
@@ -254,7 +254,7 @@ def test_this_machine_alone_may_ask_and_no_other_site(data: StudyData) -> None:
 
 
 def test_on_another_address_a_token_is_asked_for(data: StudyData) -> None:
-    app = make_app(data, token="right", alone=False)
+    app = app_of(data, token="right", alone=False)
     browser = app.test_client()
     for path in (
         "/",
@@ -278,7 +278,7 @@ def test_what_no_page_sends_is_answered_with_a_sentence_and_no_traceback(
     data: StudyData, capsys: pytest.CaptureFixture[str]
 ) -> None:
     corrections: list[object] = []
-    app = make_app(data, correct=lambda *asked: corrections.append(asked))
+    app = app_of(data, correct=lambda *asked: corrections.append(asked))
 
     @app.get("/broken")
     def broken() -> str:
@@ -310,7 +310,7 @@ def test_silent_connections_are_closed_and_keep_nobody_from_being_answered(
         ports.append(port)
         ready.set()
 
-    serving = (make_app(data), "127.0.0.1", 0, told)
+    serving = (app_of(data), "127.0.0.1", 0, told)
     threading.Thread(target=serve, args=serving, daemon=True).start()
     assert ready.wait(20)
     before = threading.active_count()
@@ -330,7 +330,7 @@ def test_silent_connections_are_closed_and_keep_nobody_from_being_answered(
 def test_what_is_being_answered_is_waited_for_when_the_server_ends(
     data: StudyData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    app, began, done = make_app(data), threading.Event(), threading.Event()
+    app, began, done = app_of(data), threading.Event(), threading.Event()
 
     @app.get("/slow")
     def slow() -> str:
@@ -405,7 +405,7 @@ def test_an_origin_that_is_no_address_is_refused(origin: str) -> None:
 
 def test_a_report_that_is_a_link_elsewhere_is_not_shown(own: Session, tmp_path: Path) -> None:
     (tmp_path / "secret").write_text("secret")
-    browser = make_app(StudyData(*list_sessions(own.path.parent))).test_client()
+    browser = app_of(StudyData(*list_sessions(own.path.parent))).test_client()
     address, report = f"/report/{own.name}", own.path / "report.html"
     assert browser.get(address).text == report.read_text(encoding="utf-8")
     report.unlink()

@@ -58,7 +58,7 @@ def test_what_waits_is_saved_together_and_reported_once(tmp_path: Path) -> None:
 
 def test_one_that_cannot_be_saved_takes_no_other_with_it(tmp_path: Path) -> None:
     disk = Disk()
-    saver = Saver(disk.correct)
+    saver = Saver(disk.correct, disk.report)
     disk.go.clear()
     tickets = [
         saver.add(tmp_path, joint(k, name), "me") for k, name in enumerate(["a", "bad", "b"])
@@ -73,7 +73,7 @@ def test_one_that_cannot_be_saved_takes_no_other_with_it(tmp_path: Path) -> None
 
 def test_authors_and_takings_back_keep_their_order(tmp_path: Path) -> None:
     disk = Disk()
-    saver = Saver(disk.correct)
+    saver = Saver(disk.correct, disk.report)
     saver.wait(saver.add(tmp_path, joint(1), "me"))
     disk.go.clear()
     saver.add(tmp_path, joint(2), "me")

@@ -2,7 +2,6 @@
 
 import pytest
 from liex_lab.dashboards.app.data import StudyData
-from liex_lab.dashboards.app.server import make_app
 from liex_lab.dashboards.figures import social
 from liex_lab.dashboards.figures.animals import SessionAnimal, session_animals
 from liex_lab.dashboards.figures.style import drawing, image_bytes
@@ -10,6 +9,7 @@ from liex_lab.dashboards.report.report import render
 from liex_lab.pipelines.study.run import list_sessions
 
 from liex_lab.sessions import Session
+from tests.dashboards.served import app_of
 from tests.sessions.pair import write_pair
 from tests.sessions.walking_mouse import WalkingMouse, steady, write
 
@@ -59,7 +59,7 @@ def test_the_report_of_several_has_them_and_that_of_one_has_not(pair, tmp_path):
 
 
 def test_the_page_of_a_session_shows_interactions_and_leads_to_the_other_animal(pair):
-    client = make_app(StudyData(*list_sessions(pair[0].path.parent))).test_client()
+    client = app_of(StudyData(*list_sessions(pair[0].path.parent))).test_client()
     page = client.get("/session/pair-animal1").text
     assert ">Interactions<" in page
     assert 'href="/session/pair-animal2"' in page

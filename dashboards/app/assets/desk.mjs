@@ -63,7 +63,6 @@ class Desk {
     this.build();
     this.stage = new Stage(this.canvas, this.source);
     this.player = new Player(this.source, this.stage);
-    this.stage.onPlaceable = () => about.may_correct;
     this.stage.onPlace = (row, joint, to) => this.placeJoint(row, joint, to);
     this.stage.onDrag = (dragged) => this.tryJoint(dragged);
     this.stage.onPick = (pixel) => this.clerk.addPixel(pixel);
@@ -78,14 +77,13 @@ class Desk {
     document.addEventListener("keydown", this.press);
     window.addEventListener("beforeunload", this.leave);
     this.player.go(this.source.rowAt(at));
-    this.readBouts().then(() => this.doubts.read()).then(() => about.may_correct && this.clerk.ask())
+    this.readBouts().then(() => this.doubts.read()).then(() => this.clerk.ask())
       .then(() => this.crossings.read())
       .catch((error) => this.notify(error.message, true));
     await this.stage.first;
   }
 
   build() {
-    const may = this.about.may_correct;
     this.canvas = make("canvas", { class: "desk-stage", tabindex: "0", role: "img",
       "aria-label": "depth image as height above the floor, with the skeleton; keys are listed beside it" });
     this.playButton = button("▶ Play", "space", () => this.player.play(!this.player.playing), { class: "main desk-play" });
@@ -106,16 +104,16 @@ class Desk {
       ...this.actions.map((one, k) => {
         const swatch = make("i", {});
         swatch.style.background = one.colour;
-        const made = button("", keyOf(k) ? `key ${keyOf(k)}` : "", () => this.name(one.word), { disabled: !may, "data-word": one.word });
+        const made = button("", keyOf(k) ? `key ${keyOf(k)}` : "", () => this.name(one.word), { "data-word": one.word });
         made.append(make("kbd", {}, keyOf(k) || " "), swatch, one.title);
         return made;
       }));
     const deeds = make("div", { class: "desk-bar" },
-      button("No name", "0", () => this.unname(), { disabled: !may }),
-      button("Head ⇄ tail", "F", () => this.flip(), { disabled: !may }),
+      button("No name", "0", () => this.unname()),
+      button("Head ⇄ tail", "F", () => this.flip()),
       button("[ from", "[", () => this.mark(0)), button("to ]", "]", () => this.mark(1)),
-      button("Take back", "U", () => this.clerk.undo(), { disabled: !may }),
-      button("Redo", "R", () => this.clerk.redo(), { disabled: !may }));
+      button("Take back", "U", () => this.clerk.undo()),
+      button("Redo", "R", () => this.clerk.redo()));
     const side = make("div", { class: "desk-side" }, this.now,
       make("h3", {}, "What it does"), this.names, deeds, this.message, this.clerk.status,
       ...this.doubts.parts, ...this.crossings.parts,

@@ -13,9 +13,8 @@ export class Clerk {
     this.mine = [];  // corrections of this visit, which U undoes
     this.unsaved = 0;
     this.status = make("p", { class: "muted desk-saved", role: "status" });
-    this.list = document.getElementById("correct-made");  // absent if nothing may be corrected
+    this.list = document.getElementById("correct-made");
     this.sentence = document.getElementById("correct-sentence");
-    if (!this.sentence) return;
     this.sentence.form.addEventListener("submit", async (event) => {
       event.preventDefault();
       if (await this.correct(this.sentence.value)) this.sentence.value = "";
@@ -23,13 +22,12 @@ export class Clerk {
   }
 
   addPixel(pixel) {  // to the sentence in the text field
-    if (!this.sentence || !this.sentence.value.trim()) return;
+    if (!this.sentence.value.trim()) return;
     this.sentence.value = `${this.sentence.value.trim()} ${pixel.map((one) => one.toFixed(2)).join(" ")}`;
   }
 
   async correct(sentence, placed) {  // true once it is accepted
     const { desk } = this;
-    if (!desk.about.may_correct) return false;
     const { here } = desk.doubts;
     let taken = false;
     try {
@@ -116,7 +114,6 @@ export class Clerk {
   }
 
   show({ log, redo }) {  // the corrections in effect, each with a button that undoes it
-    if (!this.list) return;
     const back = (number) => button("Take back", "", () => this.change("taking back …", { undo: true, number }));
     const lines = log.map((one) => make("li", {}, `${one.number}: ${one.message} (${one.author}, ${one.made_at}) `, back(one.number)));
     this.list.replaceChildren(log.length ? make("ul", { class: "made" }, ...lines) : make("p", { class: "muted" }, "No corrections so far."),

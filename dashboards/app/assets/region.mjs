@@ -122,18 +122,17 @@ class Region {
     this.zonePart = make("select", { id: "zone-part", "aria-label": "part of the animal that counts" },
       ...["centre", "nose", "tail_base"].map((one) => make("option", { value: one }, one.replace("_", " "))));
     this.zoneSaver = button("Save as a zone", "write it into the file of zones", () => this.saveZone(this.zoneName.value, this.zonePart.value, this.shape.corners));
-    const zones = (this.about.zones || []).map(({ name, part, corners }) => make("li", {}, `${name} (${part.replace("_", " ")}) `,
+    const zones = this.about.zones.map(({ name, part, corners }) => make("li", {}, `${name} (${part.replace("_", " ")}) `,
       button("show", "take its corners", () => { this.zoneName.value = name; this.zonePart.value = part; this.show(corners); }),
       button("take out", "remove the zone", () => this.saveZone(name, part, null))));
     const list = make("dl", {});
     KEYS.forEach(([key, does]) => list.append(make("dt", {}, make("kbd", {}, key)), make("dd", {}, does)));
-    const may = this.about.may_save && places.length;
     this.side.replaceChildren(
       make("label", { for: "region-corners" }, "Corners x,y in pixels"), this.corners,
-      ...(may ? [make("fieldset", {}, make("legend", {}, "It is the region of"), ...places),
+      make("fieldset", {}, make("legend", {}, "It is the region of"), ...places),
         make("div", { class: "region-bar" }, this.saver, this.remover),
         make("fieldset", { id: "zones" }, make("legend", {}, "Or it is a zone"),
-          make("div", { class: "region-bar" }, this.zoneName, this.zonePart, this.zoneSaver), make("ul", {}, ...zones))] : []),
+          make("div", { class: "region-bar" }, this.zoneName, this.zonePart, this.zoneSaver), make("ul", {}, ...zones)),
       this.message, make("h3", {}, "Lines for a plan"), this.lines, make("h3", {}, "Try it first"), this.command,
       make("details", { class: "desk-keys" }, make("summary", {}, "Mouse and keys"), list));
     if (this.about.message) this.notify(this.about.message, true);
