@@ -8,7 +8,7 @@ outline, other objects), 'other-body' (builds not used in training), 'other-came
 and resolutions not used in training), and the held-out split 'sealed'.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Self
@@ -241,7 +241,6 @@ class RenderedRecording(Recording):
         stage: Stage,
         *,
         mirrored: bool = False,
-        events: Sequence[Event] = (),
         loss: Loss | None = None,
     ) -> None:
         """Record a stage.
@@ -250,7 +249,6 @@ class RenderedRecording(Recording):
             name: of the recording.
             stage: everything before the camera.
             mirrored: exchange left and right, of a camera without lens distortion.
-            events: its corruptions, in order of their start.
             loss: readings that are lost in its frames.
         """
         camera = stage.scene.camera
@@ -264,7 +262,7 @@ class RenderedRecording(Recording):
             read=lambda index: self.depths(index, index + 1)[0],
         )
         self.stage = stage
-        self.events = list(events)
+        self.events: list[Event] = []
         self._loss = loss
         self._sides = np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
         self.skeleton = stage.skeleton

@@ -362,13 +362,10 @@ class OnlineTracker:
     Args:
         subject: the animal.
         lag: frames by which a row is delayed.
-        tuning: motion and association parameters; None uses the animal's own.
     """
 
-    def __init__(
-        self, subject: Subject, lag: int = 0, tuning: TrackingParameters | None = None
-    ) -> None:
-        tuning = tuning or TrackingParameters.of(subject.skeleton.name)
+    def __init__(self, subject: Subject, lag: int = 0) -> None:
+        tuning = TrackingParameters.of(subject.skeleton.name)
         self._subject = subject
         self._lag = lag
         self._motion = tuning.motion

@@ -385,8 +385,6 @@ def to_track(
     curve: SmoothedCurve,
     doubt: Array,
     ahead: bool = False,
-    due: slice = slice(None),
-    tuning: TrackingParameters | None = None,
     usual_px: float | None = None,
 ) -> Track:
     """The rows of a track that a smoothed curve gives: measured, bridged over a gap, or missing.
@@ -398,31 +396,26 @@ def to_track(
         curve: smoothed poses of the n frames, arena frame.
         doubt: (n,) probability that head and tail are exchanged.
         ahead: extend the curve for up to `bridge_s` after the last measurement (prediction).
-        due: rows to return; gaps are determined from all n.
-        tuning: motion parameters with the calibration factors; None uses the animal's own.
         usual_px: the animal's usual number of pixels; None uses the median of these frames.
 
     Returns:
-        A track of the rows `due`; NaN if nothing was measured or bridged, flagged as hidden if too
-        little of the animal is visible next to a nearer object.
+        A track of n rows; NaN if nothing was measured or bridged, flagged as hidden if too little
+        of the animal is visible next to a nearer object.
     """
-    tuning = tuning or TrackingParameters.of(subject.skeleton.name)
     measured = curve.used & (path >= 0)
     bridged = short_gaps(observed.seconds, measured, subject.bridge_s, ahead)
-    track = Track.empty(subject.skeleton, observed.times_ns[due])
-    write_curve(subject, track, curve[due], tuning)
+    track = Track.empty(subject.skeleton, observed.times_ns)
+    write_curve(subject, track, curve, TrackingParameters.of(subject.skeleton.name))
     usual_px = usual_pixels(observed, path) if usual_px is None else usual_px
     in_view = share_in_view(observed, path, usual_px)
     unknown = lies_unknown(in_view, doubt)
     objects = np.isfinite(observed.objects[..., 0]).sum(axis=1)
-    n_animals = np.clip(objects, observed.known.any(axis=1), subject.n_animals)
-    track.n_animals[:] = n_animals[due]
+    track.n_animals[:] = np.clip(objects, observed.known.any(axis=1), subject.n_animals)
     # animals that touch are one object
-    strayed = doubted(subject, observed, path, in_view, np.maximum(n_animals, subject.n_animals))
-    masks = measured & ~unknown, bridged, strayed
-    some = (mask[due] for mask in masks)
-    mask_and_flag(subject, track, observed[due], path[due], doubt[due], *some)
-    hide(track, (unknown & ~bridged)[due])
+    n_animals = np.maximum(track.n_animals, subject.n_animals)
+    strayed = doubted(subject, observed, path, in_view, n_animals)
+    mask_and_flag(subject, track, observed, path, doubt, measured & ~unknown, bridged, strayed)
+    hide(track, unknown & ~bridged)
     return track
 
 
