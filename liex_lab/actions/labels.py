@@ -284,7 +284,6 @@ class RaterAgreement:
     Attributes:
         n: number of items rated by both.
         observed: share of items with the same rating.
-        expected: share of the same rating by chance.
         kappa: agreement beyond chance, relative to its maximum: 1 for perfect agreement, 0 for
             chance; NaN if undefined.
         low: lower limit of its 95 % interval; NaN if undefined.
@@ -293,7 +292,6 @@ class RaterAgreement:
 
     n: int
     observed: float
-    expected: float
     kappa: float
     low: float
     high: float
@@ -305,32 +303,15 @@ def cohens_kappa(first: Sequence[str], second: Sequence[str]) -> RaterAgreement:
     Args:
         first: the first rater's words.
         second: the second rater's words.
-
-    Raises:
-        ValueError: they did not rate the same number of items.
     """
-    if len(first) != len(second):
-        raise ValueError(f"two raters of the same items, got {len(first)} and {len(second)}")
-    n = len(first)
-    nan = float("nan")
-    if n == 0:
-        return RaterAgreement(0, nan, nan, nan, nan, nan)
-    words, code = np.unique([*first, *second], return_inverse=True)
-    share = np.zeros((len(words), len(words)))
-    np.add.at(share, (code[:n], code[n:]), 1.0 / n)
-    rows = share.sum(axis=1)
-    columns = share.sum(axis=0)
-    observed = float(np.trace(share))
-    expected = float(rows @ columns)
-    if expected >= 1.0 - 1e-12:  # both use one word for everything
-        return RaterAgreement(n, observed, expected, nan, nan, nan)
-    kappa = (observed - expected) / (1.0 - expected)
-    own = np.diag(share) @ ((1.0 - (rows + columns) * (1.0 - kappa)) ** 2)
-    both = (columns[:, None] + rows[None, :]) ** 2
-    other = (1.0 - kappa) ** 2 * ((share * both).sum() - np.diag(share) @ np.diag(both))
-    centre = (kappa - expected * (1.0 - kappa)) ** 2
-    variance = max(float(own + other - centre), 0.0) / (n * (1.0 - expected) ** 2)
-    reach = _NORMAL * float(np.sqrt(variance))
-    return RaterAgreement(
-        n, observed, expected, float(kappa), max(kappa - reach, -1.0), min(kappa + reach, 1.0)
-    )
+    from statsmodels.stats.inter_rater import cohens_kappa as fleiss_cohen_everitt
+
+    n, words, nan = len(first), sorted({*first, *second}), float("nan")
+    if len(words) < 2:
+        return RaterAgreement(n, 1.0 if n else nan, nan, nan, nan)
+    table = np.array(confusion(first, second, words))
+    with np.errstate(all="ignore"):  # a test of kappa = 0, which is not used, may divide by 0
+        found = fleiss_cohen_everitt(table)
+    reach = _NORMAL * float(np.sqrt(max(found.var_kappa, 0.0)))
+    low, high = max(found.kappa - reach, -1.0), min(found.kappa + reach, 1.0)
+    return RaterAgreement(n, float(table.trace() / n), float(found.kappa), float(low), float(high))
