@@ -175,7 +175,7 @@ def definitions(limits: InteractionThresholds) -> dict[str, str]:
 def find_interactions(
     time_s: Array,
     animals: Sequence[Individual],
-    limits: InteractionThresholds | None = None,
+    limits: InteractionThresholds,
     frame_index: NDArray[np.int64] | None = None,
     outlines: NDArray[np.floating] | None = None,
 ) -> Interactions:
@@ -184,12 +184,11 @@ def find_interactions(
     Args:
         time_s: (n,) times of the frames, s since the first, increasing.
         animals: two or more, each with n frames.
-        limits: the thresholds; None uses the defaults.
+        limits: the thresholds.
         frame_index: (n,) index of each frame in the recording; None counts from 0.
         outlines: (n, K, 4) centre, mm, with the mean height, and area, mm^2, of what is in view;
             NaN if absent. None if there was no depth.
     """
-    limits = limits or InteractionThresholds()
     whole = [one.bridged(time_s, limits.merge_s) for one in animals]
     arena = _Arena(time_s, whole, limits, outlines)
     found = sorted(arena.events(), key=lambda event: (event.start, event.stop, event.word))

@@ -161,13 +161,13 @@ class Points:
 _Held = Mapping[str, Any]
 
 
-def read_points(path: str | Path, names: PointNames | None = None) -> Points:
+def read_points(path: str | Path, names: PointNames) -> Points:
     """The 3D points of one animal from a file of another program.
 
     Args:
         path: .csv (a column per coordinate, as `nose_x`, or a row per frame and keypoint), .nc of
             movement, .mat of DANNCE, or .npz with `points_mm` (n, P, 3), `points` and `time_s`.
-        names: what the file does not state; None for millimetres, z up and an estimated floor.
+        names: what the file does not state.
 
     Raises:
         LiexError: the file cannot be read, holds 2D points, several animals of which none is
@@ -176,7 +176,7 @@ def read_points(path: str | Path, names: PointNames | None = None) -> Points:
     return _read(path, names, several=False)[0]
 
 
-def read_animals(path: str | Path, names: PointNames | None = None) -> list[Points]:
+def read_animals(path: str | Path, names: PointNames) -> list[Points]:
     """The 3D points of every animal in a file, or of the chosen one, see `read_points`.
 
     All stand on one floor.
@@ -184,8 +184,7 @@ def read_animals(path: str | Path, names: PointNames | None = None) -> list[Poin
     return _read(path, names, several=True)
 
 
-def _read(path: str | Path, names: PointNames | None, several: bool) -> list[Points]:
-    names = names or PointNames()
+def _read(path: str | Path, names: PointNames, several: bool) -> list[Points]:
     source = Path(path)
     kind = source.suffix.lower()
     if kind not in READERS or not source.is_file():

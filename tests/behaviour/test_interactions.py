@@ -20,6 +20,7 @@ from liex_lab.plan.sections import InteractionThresholds
 MOUSE = Skeleton.load("mouse")
 SPINE = 65.0
 HZ = 30.0
+LIMITS = InteractionThresholds()
 Path = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 
 
@@ -45,7 +46,7 @@ def comes(to_x: float, mm_s: float = 150.0, stop_s: float = 3.0) -> Path:
 
 def events(*animals: Individual, hz: float = HZ) -> pd.DataFrame:
     time_s = np.arange(len(animals[0].joints_mm)) / hz
-    return find_interactions(time_s, animals).events
+    return find_interactions(time_s, animals, LIMITS).events
 
 
 def said(table: pd.DataFrame, *words: str) -> list[tuple[str, str, str]]:
@@ -133,8 +134,8 @@ def test_frames_that_are_not_trusted_are_not_observed():
     trusted = np.ones(180, np.bool_)
     trusted[60:90] = False
     time_s = np.arange(180) / HZ
-    whole = find_interactions(time_s, [a, b]).totals
-    found = find_interactions(time_s, [a, replace(b, trusted=trusted)])
+    whole = find_interactions(time_s, [a, b], LIMITS).totals
+    found = find_interactions(time_s, [a, replace(b, trusted=trusted)], LIMITS)
     span = found.events[["start_frame", "stop_frame"]].to_numpy()
     assert ((span[:, 1] <= 60) | (span[:, 0] >= 90)).all()
     contact = found.totals[found.totals["action"] == "contact"]
@@ -142,7 +143,7 @@ def test_frames_that_are_not_trusted_are_not_observed():
     assert contact["share"].tolist() == pytest.approx([1.0, 1.0])
     assert whole[whole["action"] == "contact"]["total_s"].tolist() == pytest.approx([6.0, 6.0])
     nobody = replace(b, trusted=np.zeros(180, np.bool_))
-    alone = find_interactions(time_s, [a, nobody])
+    alone = find_interactions(time_s, [a, nobody], LIMITS)
     assert len(alone.events) == 0
     assert alone.totals["observed_s"].eq(0.0).all()
     assert alone.totals["share"].isna().all()
@@ -158,7 +159,9 @@ def test_short_pauses_of_a_measurement_are_bridged(lost, frames):
     contact = events(a, b).query("action == 'contact'")
     assert (contact["stop_frame"] - contact["start_frame"]).sum() == frames
     # bridged frames are no clearer than the one before
-    late = find_interactions(np.arange(180) / HZ, [a, replace(b, clear=np.arange(180) >= 100)])
+    late = find_interactions(
+        np.arange(180) / HZ, [a, replace(b, clear=np.arange(180) >= 100)], LIMITS
+    )
     own = late.totals.query("action == 'nose_to_side'")
     assert own["observed_s"].to_numpy() == pytest.approx((80 - lost) / HZ)
 
@@ -177,7 +180,7 @@ def test_an_interaction_begins_and_ends_within_its_limits():
 def test_poses_whose_head_is_in_doubt_only_bridge_what_depends_on_it(sure, stop):
     a, b, frame = mouse("a", still(0.0, 0.0)), mouse("b", still(0.0, 32.0)), np.arange(180)
     b = replace(b, ends=(frame < 100) | (frame >= sure))
-    found = find_interactions(frame / HZ, [a, b])
+    found = find_interactions(frame / HZ, [a, b], LIMITS)
     ends = found.events.set_index("action")["stop_frame"]
     assert (ends["side_by_side_same"], ends["huddle"], ends["contact"]) == (stop, 180, 180)
     seen = found.totals.query("action == 'side_by_side_same'")["observed_s"].to_numpy()
@@ -214,7 +217,7 @@ def covered_pair(turned: float = 0.0, **of_b: Any) -> tuple[list[Individual], np
 
 
 def mounts(animals: list[Individual], outlines: np.ndarray | None) -> pd.DataFrame:
-    found = find_interactions(np.arange(180) / HZ, animals, outlines=outlines)
+    found = find_interactions(np.arange(180) / HZ, animals, LIMITS, outlines=outlines)
     return found.events.query("action == 'mount'")
 
 
@@ -224,7 +227,7 @@ def test_a_mount_is_seen_by_the_outline_of_a_covered_animal():
     assert said(found) == [("a", "b", "mount")]
     assert found[["start_frame", "stop_frame", "score"]].to_numpy().tolist() == [[90, 150, 0.0]]
     assert found["directed"].all()
-    whole = find_interactions(np.arange(180) / HZ, animals, outlines=outlines)
+    whole = find_interactions(np.arange(180) / HZ, animals, LIMITS, outlines=outlines)
     touch = whole.events.query("action == 'contact' and start_frame <= 90 and stop_frame >= 150")
     assert len(touch) == 1
     own = whole.totals.query("action == 'mount'").set_index("agent")
@@ -255,7 +258,7 @@ def test_distances_of_skins_agree_with_those_of_the_meshes():
     pose = Pose.home(MOUSE)
     skin = scale * surface.vertices(pose)[: surface.n_trunk_vertices]
     joints = scale * pose.joints(MOUSE)
-    limits = InteractionThresholds()
+    limits = LIMITS
     rng = np.random.default_rng(3)
     for _ in range(20):
         way, shift = rng.uniform(-np.pi, np.pi), np.append(rng.uniform(-90.0, 90.0, 2), 0.0)

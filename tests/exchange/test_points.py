@@ -131,7 +131,7 @@ def changed(folder: Path, **arrays: Any) -> Path:
 )
 def test_what_cannot_be_used_is_one_sentence(arrays, sentence, tmp_path):
     with pytest.raises(LiexError, match=sentence) as raised:
-        read_points(changed(tmp_path, **arrays))
+        read_points(changed(tmp_path, **arrays), PointNames())
     assert "b.npz" in str(raised.value)
 
 
@@ -143,7 +143,7 @@ def test_two_animals_need_a_choice_and_a_table_without_z_is_refused(tmp_path):
     with pytest.raises(LiexError, match="holds 2D points"):
         read_points(tmp_path / "flat.csv", PointNames(fps=20.0))
     with pytest.raises(LiexError, match="is not a file"):
-        read_points(tmp_path / "none.csv")
+        read_points(tmp_path / "none.csv", PointNames())
 
 
 @pytest.mark.parametrize(

@@ -216,8 +216,9 @@ REAL = Path(__file__).parents[2].parent / "shared/data/mouse_actions_3d/adult_61
 
 @pytest.mark.skipif(not REAL.is_file(), reason=ABSENT)
 def test_points_of_a_real_mouse_pass_the_checks():
-    found = read_points(REAL)
-    mapped = PointNames().of_joints(SKELETON.names, found.names)
+    names = PointNames()
+    found = read_points(REAL, names)
+    mapped = names.of_joints(SKELETON.names, found.names)
     track = track_of_points(found, SKELETON, mapped, 0.5)
     check_track(track, Plan.load("mouse"))
     assert 50.0 < np.median(track.spine_mm) < 80.0

@@ -5,6 +5,7 @@ from typing import Any
 
 from liex_lab import behaviour
 from liex_lab.behaviour.interactions import Individual, find_interactions
+from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.sessions import Session, SessionWriter
 from tests.sessions.walking_mouse import WalkingMouse, steady
 
@@ -23,7 +24,7 @@ def write_pair(folder: Path, seconds: float = 3.0, group: str = "", **more: Any)
     )
     tracks = [mouse.track() for mouse in mice]
     animals = [Individual.of_track(*one) for one in zip(NAMES, tracks, strict=True)]
-    together = find_interactions(times, animals)
+    together = find_interactions(times, animals, InteractionThresholds())
     sessions = []
     for name, mouse, track in zip(NAMES, mice, tracks, strict=True):
         facts = {"name": f"pair-{name}", "individual": name, "input_sha256": "ab" * 32} | more

@@ -66,7 +66,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     people = [
         Individual.of_track(*one) for one in zip(names, (t.track for t in tracked), strict=True)
     ]
-    together = find_interactions(MOUSE.times_s, people)
+    together = find_interactions(MOUSE.times_s, people, PLAN.interactions)
     for k, name in enumerate(names):
         stated = [f"session.name=pair-{name}", f"session.individual={name}"]
         origin = MOUSE.provenance(

@@ -8,6 +8,7 @@ from liex_lab.pipelines.evaluation.several import evaluate_several
 from liex_lab.behaviour.interactions import Individual, find_interactions
 from liex_lab.errors import LiexError
 from liex_lab.evaluation.scores import MeasuredIndividual
+from liex_lab.plan.sections import InteractionThresholds
 from liex_lab.simulation.scenes.catalogue import SEALED_FROM
 
 
@@ -24,7 +25,9 @@ def test_two_animals_near_the_truth_score_high_and_an_exchange_is_a_swap(monkeyp
             Individual(f"animal{k}", recording.skeleton, T @ one, trusted, trusted, trusted)
             for k, one in enumerate(joints, 1)
         ]
-        found = find_interactions((recording.times_ns - recording.times_ns[0]) * 1e-9, animals)
+        found = find_interactions(
+            (recording.times_ns - recording.times_ns[0]) * 1e-9, animals, InteractionThresholds()
+        )
         own = [MeasuredIndividual(one, trusted, interactions=found.events) for one in joints]
         return own, [], 0
 
