@@ -408,13 +408,14 @@ class PoseEstimator:
 
         Args:
             detection: n frames, each with at least one candidate.
-            size: the animal's size over home size.
+            size: the animal's size over home size; ignored by methods of fixed size.
             parallel: use all cores rather than one.
 
         Returns:
             The chosen poses in the view frame; their expected error is still that of `choose`.
         """
         method = self.model.method
+        size = size if method.session_size else 1.0
         skeleton = self.skeleton
         images = detection.images
         candidates = detection.rotations, detection.positions, detection.scores

@@ -17,9 +17,11 @@ another one, of which little is in view. Only components of several animals pay 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import cv2
 import numpy as np
@@ -33,7 +35,7 @@ from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.processes import in_parallel, threads
 from liex_lab.scene._blob_kernels import N_PX, SLOPE, back_slope, blob_moments
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
-from liex_lab.scene.height_maps import ANIMAL_HEIGHTS, N_OBJECTS, HeightMaps
+from liex_lab.scene.height_maps import ANIMAL_HEIGHTS, N_OBJECTS, HeightMaps, view_of
 from liex_lab.tracking.observations import Array, Observations
 from liex_lab.tracking.residual import render_crops
 from liex_lab.tracking.tracker import FrameTracker
@@ -292,15 +294,15 @@ class JointTracker:
         bodies = np.full((*labels.shape[:2], m), -1)
         bodies[:, :n_bodies, 0] = np.arange(n_bodies)
         up_mm = np.zeros(labels.shape[:2])
-        for k, body in enumerate(self._bodies if m == 2 and not self._camera_view else ()):
-            usual_mm = self.heights_mm[self.trackers.index(body)]
-            share = np.clip(1.0 - body.scene.area_mm2 / blobs.blobs.area_mm2, 0.0, 1.0)
-            for i, heights in enumerate(blobs.heights):
-                inside = heights[heights > 0]
-                upper = inside >= np.quantile(inside, share[i])
-                raised_mm = inside[upper].mean() / 16.0 - usual_mm
+        for i, heights in enumerate(blobs.heights if m == 2 and not self._camera_view else ()):
+            ordered = np.sort(heights[heights > 0])
+            for k, body in enumerate(self._bodies):
+                usual_mm = self.heights_mm[self.trackers.index(body)]
+                lower = max(1.0 - body.scene.area_mm2 / blobs.blobs.area_mm2[i], 0.0)
+                least = ordered[math.ceil(lower * (len(ordered) - 1))]
+                raised_mm = ordered[ordered >= least].mean() / 16.0 - usual_mm
                 if raised_mm > _ON_TOP * usual_mm:
-                    labels[i, n_bodies + k, heights > 0] = ~upper
+                    labels[i, n_bodies + k, heights > 0] = heights[heights > 0] < least
                     bodies[i, n_bodies + k, 0], up_mm[i, n_bodies + k] = k, raised_mm
         return labels, bodies, up_mm
 
@@ -315,27 +317,28 @@ class JointTracker:
         angles = np.arange(_N_DIRECTIONS * n_sides) * np.pi / _N_DIRECTIONS
         share = np.cumsum(areas[chosen]) / areas[chosen].sum()
         volumes = (areas * self.heights_mm)[chosen]
-        v, u = np.mgrid[: blobs.heights.shape[1], : blobs.heights.shape[2]]
-        labels = np.full((len(blobs.n_px), n_ways, *u.shape), -1, np.int8)
+        labels = np.full((len(blobs.n_px), n_ways, *blobs.heights.shape[1:]), -1, np.int8)
         for own, heights in zip(labels, blobs.heights, strict=True):
-            inside = heights > 0
-            pixels = np.array([u[inside], v[inside]])
+            v, u = np.nonzero(heights > 0)
+            pixels = np.array([u, v], float)
             axes = np.linalg.eigh(np.cov(pixels))[1]  # across and along
             along = (axes @ (np.cos(angles), np.sin(angles))).T @ pixels
-            cuts = np.quantile(along, share[:-1], axis=1)
-            parts = (along > cuts[..., None]).sum(axis=0)
+            last = (share[:-1] * (len(u) - 1)).astype(int)
+            cuts = np.partition(along, last, axis=1)[:, last].T
+            parts = (along > cuts[..., None]).sum(axis=0, dtype=np.int8)
             if len(parts) > n_ways:
-                of_first = (parts == 0) @ heights[inside].astype(float) / heights[inside].sum()
+                inside = heights[v, u].astype(float)
+                of_first = (parts == 0) @ inside / inside.sum()
                 off = np.abs(of_first - volumes[0] / volumes.sum()).reshape(n_sides, n_ways)
                 parts = parts.reshape(n_sides, n_ways, -1)[off.argmin(axis=0), np.arange(n_ways)]
-            own[:, inside] = parts
+            own[:, v, u] = parts
         return labels, np.tile(bodies[chosen], (len(labels), n_ways, 1))
 
     def _cut(self, parts: HeightMaps, mine: Mask, up_mm: Array) -> HeightMaps:
         """The same height maps (k rows) without the pixels that are not `mine` (k, S, S), each
         measured from up_mm (k,) above the floor; in place.
         """
-        parts.heights[~mine] = 0
+        parts.heights[:] *= mine
         behind_mm = self.scene.view.behind_mm if self._camera_view else 0.0
         lift = -up_mm
         if self._camera_view:  # heights are measured from behind the middle of each part
@@ -374,14 +377,14 @@ class JointTracker:
         """
         q, p, m = bodies.shape
         ways = labels.reshape(q * p, *labels.shape[2:])
-        part, way = np.nonzero(bodies.reshape(q * p, m).T >= 0)
-        which = bodies.reshape(q * p, m)[way, part]
+        each = np.arange(len(self._bodies))[:, None, None]
+        which, part, way = np.nonzero(each == bodies.reshape(q * p, m).T)
         up_mm = np.where(part == 0, raised_mm.ravel()[way], 0.0)
         parts = self._cut(blobs[way // p], ways[way] == part[:, None, None], up_mm)
         drawn = np.zeros((len(way) + 1, *ways.shape[1:]), np.float32)
         for k, body in enumerate(self._bodies):
-            rows = np.flatnonzero((which == k) & parts.found)
-            drawn[rows] = self._rendered(body, parts[rows])
+            rows = slice(*np.searchsorted(which, (k, k + 1)))
+            self._draw(body, parts[rows], drawn[rows])
         shown = np.full((q * p, m), -1)
         shown[way, part] = np.arange(len(way))
         cost = np.empty(q * p)
@@ -391,22 +394,20 @@ class JointTracker:
         cost[(shown < 0).all(axis=1)] = np.inf
         return cost.reshape(q, p), drawn, shown.reshape(q, p, m)
 
-    def _rendered(self, body: FrameTracker, parts: HeightMaps) -> NDArray[np.float32]:
-        """The best pose of a body in each part (k rows), rendered: (k, S, S) mm."""
-        drawn = np.zeros(parts.heights.shape, np.float32)
-        if not len(drawn):
-            return drawn
+    def _draw(self, body: FrameTracker, parts: HeightMaps, drawn: NDArray[np.float32]) -> None:
+        """Render the best pose of a body in each part (k rows) into `drawn` (k, S, S) mm."""
         cameras = self.scene.crop_cameras(parts, self._camera_view)
-        best = self.estimator.best_of(parts, cameras, body.size)
-        some = np.flatnonzero(best.found)
+        found = self.estimator.candidates(parts, cameras, body.size)
+        some = np.flatnonzero(found.usable)
         if len(some):
-            pose = best.chosen.pose[some]
+            found = found[some]
+            pose = self.estimator.pick(found, body.size).pose
+            pose = pose.moved(view_of(found.crop_cameras).inverse())
             if body.shape is not None:
                 pose = body.shape.corrected(self.estimator, pose, body.size)
             pose = pose.moved(self.scene.floor.T_arena_camera)
             across = body.body.across(pose.scale)
-            drawn[some] = render_crops(body.body.surface, pose, across, parts[some], self.scene)
-        return drawn
+            drawn[some] = render_crops(body.body.surface, pose, across, found.crops, self.scene)
 
     def _observed(self, blobs: HeightMaps) -> NDArray[np.float32]:
         """Depth (q, S, S) mm of components, 0 outside."""
@@ -424,17 +425,12 @@ class JointTracker:
     ) -> Labels:
         """Labels (q, S, S) of pixels of depth `observed` by the nearest of bodies (q, m, S, S)."""
         out = labels.copy()
-        for i, bodies in enumerate(drawn):
-            if not all(body.any() for body in bodies):
-                continue
-            away = np.stack(
-                [
-                    cv2.distanceTransform((body == 0).astype(np.uint8), cv2.DIST_L2, 3)
-                    for body in bodies
-                ]
-            )
-            off = np.where(bodies > 0, np.abs(bodies - observed[i]), 1e3 * (1.0 + away))
-            out[i] = np.where(observed[i] > 0, off.argmin(axis=0), -1)
+        some = np.flatnonzero(np.all(drawn.any(axis=(2, 3)), axis=1))
+        away = np.zeros(drawn.shape, np.float32)
+        for i, j in product(some, range(drawn.shape[1])):
+            empty = (drawn[i, j] == 0).astype(np.uint8)
+            away[i, j] = cv2.distanceTransform(empty, cv2.DIST_L2, 3)
+        in_parallel(_nearest_body, len(some), some, observed, drawn, away, out)
         return out
 
 
@@ -493,6 +489,23 @@ def _measure_parts(planes, intrinsics, rotation, behind_mm, crops, start, stop):
         if behind_mm > 0.0 and moments[N_PX] > 0:
             moments[SLOPE] = back_slope(heights, origin, step, intrinsics, distance, moments)
         crops.n_px[k] = int(moments[N_PX] * step * step)
+
+
+@kernel(nogil=True)
+def _nearest_body(some, observed, drawn, away, out, start, stop):
+    """Fill labels (q, S, S) of pixels of depth (q, S, S) mm, in `some` (k,) of the images, with the
+    nearest of bodies (q, m, S, S) mm in depth, or by `away` (q, m, S, S) px where none is drawn.
+    """
+    for i in some[start:stop]:
+        for v in range(observed.shape[1]):
+            for u in range(observed.shape[2]):
+                least = np.inf
+                for j in range(drawn.shape[1] if observed[i, v, u] > 0 else 0):
+                    off = 1e3 * (1.0 + away[i, j, v, u])
+                    if drawn[i, j, v, u] > 0:
+                        off = abs(drawn[i, j, v, u] - observed[i, v, u])
+                    if off < least:
+                        least, out[i, v, u] = off, j
 
 
 @kernel(nogil=True)
