@@ -185,7 +185,7 @@ class LiveView:
         skeleton: the animals' skeleton.
         to: 'viewer' starts a viewer on this machine; a name ending in .rrd is a file to write; else
             the address of a viewer.
-        blueprint: the layout, a Rerun blueprint; None if absent.
+        blueprint: the layout, a Rerun blueprint.
         names: of the animals; a single one has no name and the usual colour.
 
     Raises:
@@ -199,8 +199,8 @@ class LiveView:
         T_arena_camera: SE3,
         skeleton: Skeleton,
         to: str,
-        blueprint: Any = None,
-        names: Sequence[str] = ("",),
+        blueprint: Any,
+        names: Sequence[str],
     ) -> None:
         self._edges = skeleton.edges
         self._stream = rr.RecordingStream(
@@ -210,8 +210,7 @@ class LiveView:
             self._stream.save(Path(to))
         else:
             self._stream.connect_grpc(begin_viewer() if to == "viewer" else to)
-        if blueprint is not None:
-            self._stream.send_blueprint(blueprint)
+        self._stream.send_blueprint(blueprint)
         self._floor_mm = float(T_arena_camera.translation[2])
         log_camera(self._stream, camera, T_arena_camera)
         dot_m = dot_mm(skeleton) / MM_PER_UNIT

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from liex_lab.dashboards.replay.layouts import live_blueprint
 from rerun.chunk import RrdReader
 from typer.testing import CliRunner
 
@@ -56,9 +57,8 @@ def test_every_skeleton_has_its_error_and_every_fifth_frame_its_picture(
 def test_each_of_two_animals_has_a_skeleton_a_name_and_an_error(tmp_path: Path) -> None:
     file = tmp_path / "pair.rrd"
     skeleton = Skeleton.load("mouse")
-    view = viewer.LiveView(
-        "pair", KINECT_V2, SE3.identity(), skeleton, str(file), None, ("animal1", "animal2")
-    )
+    names, layout = ("animal1", "animal2"), live_blueprint(0.1)
+    view = viewer.LiveView("pair", KINECT_V2, SE3.identity(), skeleton, str(file), layout, names)
     row = Track.empty(skeleton, np.zeros(1, np.int64))
     posed = replace(row, joints_mm=np.ones((1, 5, 3)), predicted_error_mm=np.array([2.0]))
     view.show(DepthFrame(0, 0, np.full((424, 512), 700.0, np.float32)), [row, posed])
