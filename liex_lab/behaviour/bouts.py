@@ -399,18 +399,21 @@ class MouseRules(BehaviourThresholds):
         }
 
 
-def find_bouts(frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules) -> pd.DataFrame:
+def find_bouts(
+    frames: pd.DataFrame, kinematics: pd.DataFrame, rules: MouseRules | None = None
+) -> pd.DataFrame:
     """The rule-based table `bouts` of one animal, with the measures of each bout.
 
     Args:
         frames: the table `frames`; spine_mm is read.
         kinematics: the table `kinematics` of the same frames.
-        rules: the thresholds.
+        rules: the thresholds; None uses the defaults.
 
     Returns:
         One row per bout in order of time, source "rule"; the score is the share of its frames that
             satisfy the rule themselves.
     """
+    rules = rules or MouseRules()
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
     number = segments(time_s, observed)

@@ -28,7 +28,7 @@ from liex_lab.behaviour.activity import (
     visits,
 )
 from liex_lab.behaviour.body import SWIMS, kind_of, parents_of
-from liex_lab.behaviour.bouts import MouseRules, find_bouts, measure_bouts, of_known
+from liex_lab.behaviour.bouts import ACTIONS, MouseRules, find_bouts, measure_bouts, of_known
 from liex_lab.behaviour.days import Light, activity_by_hour, rhythm
 from liex_lab.behaviour.kinematics import Joints, kinematics
 from liex_lab.errors import PlanError
@@ -252,9 +252,9 @@ def summarise(
     frames: pd.DataFrame,
     kinematics: pd.DataFrame,
     bouts: pd.DataFrame,
-    words: Vocabulary,
-    around: Surroundings,
-    rules: MouseRules,
+    words: Vocabulary | None = None,
+    around: Surroundings | None = None,
+    rules: MouseRules | None = None,
 ) -> pd.DataFrame:
     """The table `summary`: one row for one animal.
 
@@ -262,10 +262,13 @@ def summarise(
         frames: the table `frames`.
         kinematics: the table `kinematics`.
         bouts: the table `bouts` with its measures.
-        words: actions, zones and the kind of body.
-        around: arena, zones and water.
-        rules: speeds below their pause threshold do not count as movement.
+        words: actions, zones and the kind of body; None means the rules' actions of a walking
+            animal.
+        around: arena, zones and water; None if unknown.
+        rules: speeds below their pause threshold do not count as movement; None uses the defaults.
     """
+    words = words or Vocabulary(ACTIONS)
+    around = around or Surroundings()
     time_s = kinematics["time_s"].to_numpy(float)
     observed = np.isfinite(kinematics["x_mm"].to_numpy(float))
     hold = observed_hold(kinematics)  # seconds that each observed frame stands for
@@ -288,7 +291,7 @@ def summarise(
         block |= depth_measures(kinematics, hold, around.surface_z_mm)
         block |= {name: _median(kinematics[name]) for name in ("tail_beat_hz", "tail_beat_mm")}
     else:
-        pause_mm_s = rules.pause_below_mm_s
+        pause_mm_s = (rules or MouseRules()).pause_below_mm_s
         faster = kinematics["speed_mm_s"] > np.fmax(pause_mm_s, block["speed_noise_mm_s"])
         step = kinematics["step_mm"].to_numpy(float)
         block["distance_moving_m"] = float(np.nansum(step[faster.to_numpy()])) / 1000.0

@@ -20,7 +20,7 @@ from tests.sessions.walking_mouse import WalkingMouse, steady
 
 def bouts_of(mouse: WalkingMouse, rules: MouseRules | None = None) -> pd.DataFrame:
     frames, poses = tables_of(mouse)
-    return find_bouts(frames, kinematics(frames, poses), rules or MouseRules())
+    return find_bouts(frames, kinematics(frames, poses), rules)
 
 
 def test_a_rear_is_found_once_with_its_rise_and_its_fall():
@@ -55,7 +55,7 @@ def test_a_hunched_animal_grooms_if_it_stays_where_it_is(speed, words):
     frames, poses = tables_of(WalkingMouse(steady(3.0), speed_mm_s=speed, radius_mm=400.0))
     moved = kinematics(frames, poses)
     moved.loc[30:60, "reach_mm"] = 0.65 * frames["spine_mm"].median()
-    assert list(find_bouts(frames, moved, MouseRules())["action"]) == words
+    assert list(find_bouts(frames, moved)["action"]) == words
 
 
 def test_a_bout_ends_at_a_gap_one_step_after_its_last_frame():
@@ -199,4 +199,4 @@ def test_a_rear_is_raised_above_the_usual_tail_base_and_not_that_of_one_frame() 
     poses = poses.copy()
     sunk = (poses["joint"] == "rump") & poses["time_s"].between(1.0, 2.0)
     poses.loc[sunk, "z_mm"] -= 60.0
-    assert "rear" not in set(find_bouts(frames, kinematics(frames, poses), MouseRules())["action"])
+    assert "rear" not in set(find_bouts(frames, kinematics(frames, poses))["action"])

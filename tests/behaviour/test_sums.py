@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from liex_lab.behaviour import MouseRules, Surroundings, measure, measure_session
+from liex_lab.behaviour import Surroundings, measure, measure_session
 from liex_lab.behaviour.activity import (
     _binomial,
     activity,
@@ -285,8 +285,6 @@ def test_named_and_unlabelled_time_is_the_observed_time_whatever_was_lost(case):
         moved.assign(speed_mm_s=1.0, yaw_rate_rad_s=np.nan, speed_sd_mm_s=1.0),
         bouts,
         Vocabulary(words),
-        Surroundings(),
-        MouseRules(),
     ).iloc[0]
     # the loop that a reader would write: each observed frame has the last bout around it
     time_s, stop_s = moved["time_s"].to_numpy(), stop_times(moved["time_s"].to_numpy())
