@@ -17,11 +17,9 @@ another one, of which little is in view. Only components of several animals pay 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 
 import cv2
 import numpy as np
@@ -299,7 +297,7 @@ class JointTracker:
             for k, body in enumerate(self._bodies):
                 usual_mm = self.heights_mm[self.trackers.index(body)]
                 lower = max(1.0 - body.scene.area_mm2 / blobs.blobs.area_mm2[i], 0.0)
-                least = ordered[math.ceil(lower * (len(ordered) - 1))]
+                least = ordered[int(np.ceil(lower * (len(ordered) - 1)))]
                 raised_mm = ordered[ordered >= least].mean() / 16.0 - usual_mm
                 if raised_mm > _ON_TOP * usual_mm:
                     labels[i, n_bodies + k, heights > 0] = heights[heights > 0] < least
@@ -377,8 +375,9 @@ class JointTracker:
         """
         q, p, m = bodies.shape
         ways = labels.reshape(q * p, *labels.shape[2:])
-        each = np.arange(len(self._bodies))[:, None, None]
-        which, part, way = np.nonzero(each == bodies.reshape(q * p, m).T)
+        which, part, way = np.nonzero(
+            np.arange(len(self._bodies))[:, None, None] == bodies.reshape(q * p, m).T
+        )
         up_mm = np.where(part == 0, raised_mm.ravel()[way], 0.0)
         parts = self._cut(blobs[way // p], ways[way] == part[:, None, None], up_mm)
         drawn = np.zeros((len(way) + 1, *ways.shape[1:]), np.float32)
@@ -425,12 +424,10 @@ class JointTracker:
     ) -> Labels:
         """Labels (q, S, S) of pixels of depth `observed` by the nearest of bodies (q, m, S, S)."""
         out = labels.copy()
-        some = np.flatnonzero(np.all(drawn.any(axis=(2, 3)), axis=1))
-        away = np.zeros(drawn.shape, np.float32)
-        for i, j in product(some, range(drawn.shape[1])):
-            empty = (drawn[i, j] == 0).astype(np.uint8)
-            away[i, j] = cv2.distanceTransform(empty, cv2.DIST_L2, 3)
-        in_parallel(_nearest_body, len(some), some, observed, drawn, away, out)
+        away = np.empty(drawn.shape, np.float32)
+        for at in np.ndindex(drawn.shape[:2]):
+            away[at] = cv2.distanceTransform((drawn[at] == 0).astype(np.uint8), cv2.DIST_L2, 3)
+        in_parallel(_nearest_body, len(out), observed, drawn, away, out)
         return out
 
 
@@ -492,11 +489,11 @@ def _measure_parts(planes, intrinsics, rotation, behind_mm, crops, start, stop):
 
 
 @kernel(nogil=True)
-def _nearest_body(some, observed, drawn, away, out, start, stop):
-    """Fill labels (q, S, S) of pixels of depth (q, S, S) mm, in `some` (k,) of the images, with the
-    nearest of bodies (q, m, S, S) mm in depth, or by `away` (q, m, S, S) px where none is drawn.
+def _nearest_body(observed, drawn, away, out, start, stop):
+    """Fill labels (q, S, S) of pixels of depth (q, S, S) mm with the nearest of the bodies (q, m,
+    S, S) mm in depth, or, where none is drawn, in the image, `away` (q, m, S, S) px.
     """
-    for i in some[start:stop]:
+    for i in range(start, stop):
         for v in range(observed.shape[1]):
             for u in range(observed.shape[2]):
                 least = np.inf
