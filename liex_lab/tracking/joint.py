@@ -12,7 +12,8 @@ The best explanation is then improved alternately: every pixel goes to the body 
 nearest to it in depth, or in the image where none is rendered, and each body is measured again on
 its own pixels (hard expectation maximisation). A component that one body explains as well is one
 animal, and one that a body high above the floor explains better than two is an animal on top of
-another one, of which little is in view. Only components of several animals pay for all this.
+another one, of which little is in view. One body is tried only where the component is hardly larger
+than an animal, or several explain it badly. Only components of several animals pay for all this.
 """
 
 from __future__ import annotations
@@ -50,6 +51,7 @@ _N_DIRECTIONS = 4  # of the cuts, in half a turn
 _SWEEPS = 2
 _MOST_OFF = 0.2  # of a pixel, in roots of the animal's area
 _BETTER = 0.85  # cost of several bodies over that of one
+_CLEAR = 0.4  # cost of several bodies, over c, below which one is not tried
 _ON_TOP = 0.6  # how much higher than usual an animal on another one is, in its usual heights
 
 
@@ -242,38 +244,37 @@ class JointTracker:
         q, n_bodies = len(blobs.n_px), len(self._bodies)
         rows = np.arange(q)
         observed = self._observed(blobs)
-        cuts, of_cuts = self._cuts(blobs, m)
-        whole, of_whole, raised_mm = self._with_one_body(blobs, m)
-        n_cuts = cuts.shape[1]
-        labels = np.concatenate([cuts, whole], axis=1)
-        bodies = np.concatenate([of_cuts, of_whole], axis=1)
-        raised_mm = np.pad(raised_mm, ((0, 0), (n_cuts, 0)))
-        # all in one go, as a call costs as much as a frame
-        cost, drawn, shown = self._tried(blobs, observed, labels, bodies, raised_mm)
-        best = cost[:, :n_cuts].argmin(axis=1)
+        labels, bodies = self._cuts(blobs, m)
+        on_floor = np.zeros(bodies.shape[:2])
+        cost, drawn, shown = self._tried(blobs, observed, labels, bodies, on_floor)
+        best = cost.argmin(axis=1)
         kept_cost, kept, shown = cost[rows, best], labels[rows, best], shown[rows, best]
         now = kept
         for _ in range(_SWEEPS):
             now = self._owners(observed, drawn[shown], now)
             again, drawn, fresh = self._tried(
-                blobs, observed, now[:, None], bodies[rows, best][:, None], np.zeros((q, 1))
+                blobs, observed, now[:, None], bodies[:, :1], on_floor[:, :1]
             )
             better = again[:, 0] < kept_cost
             kept_cost = np.where(better, again[:, 0], kept_cost)
             kept = np.where(better[:, None, None], now, kept)
             shown = fresh[:, 0]
-        alone = cost[:, n_cuts : n_cuts + n_bodies].min(axis=1)
-        upper = n_cuts + n_bodies + cost[:, n_cuts + n_bodies :].argmin(axis=1)
-        on_top = _BETTER * cost[rows, upper] < kept_cost
-        up_mm = np.zeros((m, q))
-        up_mm[0, on_top] = raised_mm[rows, upper][on_top]
-        kept = np.where(on_top[:, None, None], labels[rows, upper], kept)
+        largest_mm2 = max(body.scene.area_mm2 for body in self._bodies)
+        several = (kept_cost < _CLEAR) & (blobs.blobs.area_mm2 > _TORN * largest_mm2)
+        on_top, up_mm = np.zeros(q, np.bool_), np.zeros((m, q))
+        if len(some := np.flatnonzero(~several)):
+            labels, bodies, raised_mm = self._with_one_body(blobs[some], m)
+            cost, _, _ = self._tried(blobs[some], observed[some], labels, bodies, raised_mm)
+            several[some] = kept_cost[some] < _BETTER * cost[:, :n_bodies].min(axis=1)
+            upper = np.arange(len(some)), n_bodies + cost[:, n_bodies:].argmin(axis=1)
+            on_top[some] = _BETTER * cost[upper] < kept_cost[some]
+            up_mm[0, some] = np.where(on_top[some], raised_mm[upper], 0.0)
+            kept[on_top] = labels[upper][on_top[some]]
         mine = np.concatenate([kept == j for j in range(m)])
         split = self._cut(HeightMaps.join([blobs] * m), mine, up_mm.ravel())
         enough = split.blobs.area_mm2.reshape(m, q) > 0.6 * self._least_mm2
         split.n_px[~enough.ravel()] = 0
-        several = (kept_cost < _BETTER * alone) & enough.all(axis=0)
-        return split, on_top | several
+        return split, on_top | several & enough.all(axis=0)
 
     def _with_one_body(self, blobs: HeightMaps, m: int) -> tuple[Labels, NDArray[np.int64], Array]:
         """Explain components (q rows) by one body, each of B in turn: all of it is one animal, or
@@ -370,8 +371,8 @@ class JointTracker:
         (q, P, S, S), each with its body (q, P, m), -1 for none, the first of them raised (q, P) mm.
 
         Returns:
-            The cost (q, P), infinite if a part has no pose; the rendered bodies (r, S, S) mm, the
-            last of them empty; and which of them (q, P, m) is that of each part.
+            The cost (q, P) over c, infinite if a part has no pose; the rendered bodies (r, S, S)
+            mm, the last of them empty; and which of them (q, P, m) is that of each part.
         """
         q, p, m = bodies.shape
         ways = labels.reshape(q * p, *labels.shape[2:])
@@ -507,8 +508,8 @@ def _nearest_body(observed, drawn, away, out, start, stop):
 
 @kernel(nogil=True)
 def _explained(observed, drawn, shown, most_mm, out, start, stop):
-    """Fill the costs (q P,) of explaining depth (q, S, S) mm by rendered bodies (r, S, S) mm, those
-    numbered shown (q P, m), see the module.
+    """Fill the costs (q P,), over c, of explaining depth (q, S, S) mm by rendered bodies (r, S, S)
+    mm, those numbered shown (q P, m), see the module.
     """
     n_ways = len(shown) // len(observed)
     for k in range(start, stop):
@@ -525,4 +526,4 @@ def _explained(observed, drawn, shown, most_mm, out, start, stop):
                     cost += min(abs(nearest - depth[v, u]), most_mm)
                 elif nearest < np.inf:
                     cost += most_mm
-        out[k] = cost / max(n_px, 1)
+        out[k] = cost / (most_mm * max(n_px, 1))
