@@ -21,7 +21,7 @@ from scipy.optimize import linear_sum_assignment
 from liex_lab.runtime.kernels import kernel
 from liex_lab.tracking._association_kernels import transition_cost
 from liex_lab.tracking.association import NONE, HypothesisAssociation
-from liex_lab.tracking.observations import COLUMNS, Array, Observations
+from liex_lab.tracking.observations import COLUMNS, OF_COMPONENTS, Array, Observations
 from liex_lab.tracking.rfid import Readings
 from liex_lab.tracking.smoother import TrackingParameters
 from liex_lab.tracking.track import Crossing, Subject, Tracked, spans
@@ -48,7 +48,6 @@ _ONE = 1.4  # usual sizes of an outline, above which it shows several animals
 _JOIN_S = 0.5  # crossings nearer to each other are one
 _HIDES = 9.0  # cost of an animal that was in view and is not, nats
 _SIZES = 100  # frames over which the sizes of the animals of an ongoing recording are averaged
-_OF_COMPONENTS = {*COLUMNS} - {"times_ns", "has_depth", "repeats", "objects"}
 
 
 @dataclass(frozen=True)
@@ -96,18 +95,19 @@ def identify(
         )
         # cost (m - 1, S, S) of going from one assignment to another
         transition = moves[:, states[:, None, :], states[None, :, :]].sum(axis=-1)
-        path, _ = _viterbi(transition, np.zeros((len(full), len(states))))
+        path, _ = viterbi(transition, np.zeros((len(full), len(states))))
         seconds, own = observed[0].seconds[full], _own_places(observed[0][full], states[path])
         for t in np.flatnonzero(np.diff(seconds) > _GAP_S).tolist():
             transition[t] = _passed(seconds, own, subjects[0], states[path], states, t, t + 1)
         bodies = np.stack([_misfit(one)[full] for one in observed])
         apart, weight = _independent(observed[0][full])
-        shown = np.any([_fitting(one[full], subjects[0].length_mm) for one in observed], axis=0)
+        shown = np.any([fitting(one[full], subjects[0].length_mm) for one in observed], axis=0)
+        shown &= ~_covering(observed[0][full], ~apart, None)[:, None]
         fits = _fits(bodies, apart, weight * shown.all(axis=1), states)
-        path, _ = _viterbi(transition, fits)
+        path, _ = viterbi(transition, fits)
         size = np.log(np.maximum(observed[0].n_px[full, ::2], 1))
         sizes = fits + _sizes(size, bodies, weight * apart, states[path], states)
-        path, _ = _viterbi(transition, emission := sizes)
+        path, _ = viterbi(transition, emission := sizes)
         if readings is not None:
             places = observed[0].centroid_mm[full, ::2, :2].astype(float)
             read = readings.costs(seconds, places, subjects[0].length_mm)
@@ -183,7 +183,7 @@ def _by_tags(
     for carriers in permutations(range(n_animals), len(readings.tags)):
         emission = sizes.copy()
         np.add.at(emission, row, cost[reading, states[:, np.array(carriers)[tag]].T])
-        found.append((*_viterbi(transition, emission), emission, carriers))
+        found.append((*viterbi(transition, emission), emission, carriers))
     best, _, emission, carriers = min(found, key=lambda one: one[1])
     of_animals = cost[reading, states[best][row]]  # (k, N)
     totals = [of_animals[reading[:, 0], np.array(one[3])[tag]].sum() for one in found]
@@ -215,7 +215,7 @@ def own_observations(
     rows = np.flatnonzero(slots != NONE)
     for name in COLUMNS:
         values, out = getattr(observed, name), getattr(own, name)
-        if name not in _OF_COMPONENTS:
+        if name not in OF_COMPONENTS:
             out[:] = values
         else:
             for h in range(2):
@@ -240,7 +240,7 @@ def _covering(
     return np.asarray(touching & (shown < (known.sum(axis=1) - _COVERED) * usual))
 
 
-def _fitting(observed: Observations, length_mm: float) -> NDArray[np.bool_]:
+def fitting(observed: Observations, length_mm: float) -> NDArray[np.bool_]:
     """Whether (n, N) each component has a pose that the depth image does not contradict."""
     found = observed.known[:, ::2]
     for k, here in enumerate(found.T):
@@ -258,7 +258,7 @@ def covers(own: Sequence[Observations], length_mm: float) -> NDArray[np.bool_]:
         own: the observations (n) of each animal, see `own_observations`.
         length_mm: of an animal.
     """
-    fits = np.stack([_fitting(one, length_mm)[:, 0] for one in own])
+    fits = np.stack([fitting(one, length_mm)[:, 0] for one in own])
     touching = np.isfinite(own[0].objects[..., 0]).sum(axis=1) < len(own)
     here = np.stack([one.centroid_mm[:, 0, :2] for one in own])
     frames = np.arange(fits.shape[1])
@@ -471,7 +471,7 @@ def _sizes(size: Array, bodies: Array, weight: Array, path: Slots, states: Slots
     return np.asarray(weight[:, None] * np.minimum(0.5 * off.sum(axis=-1), _MOST_NATS))
 
 
-def _viterbi(transition: Array, emission: Array) -> tuple[Slots, float]:
+def viterbi(transition: Array, emission: Array) -> tuple[Slots, float]:
     """The path (m,) of least cost through the assignments, and its cost."""
     parent = np.zeros(emission.shape, np.int64)
     cost = emission[0]
@@ -559,13 +559,14 @@ def _follow(
 
     A component belongs to the animal of the least cost (d / s)^2 + 2 log s + 2 log r, d: its
     distance from where that was last in view, s: a standard deviation that grows with the time
-    since, r: the distance of that animal's body from the depth.
+    since, r: the distance of that animal's body from the depth, of which nothing follows where the
+    component may cover another animal.
 
     Yields:
         The spans whose two ends do not agree.
     """
     observed, misfit = every[0], np.stack([_misfit(one) for one in every], axis=1)
-    seconds, places = observed.seconds, observed.centroid_mm[:, ::2, :2].astype(float)
+    seconds, places = observed.seconds, observed.centroid_mm[:, ::2].astype(float)
     full = np.flatnonzero((slots != NONE).all(axis=1))
     usual_px = np.median(observed.n_px[full, ::2]) if len(full) else 0.0
     for start, stop in spans(np.asarray(~known.all(axis=1))) if len(full) else ():
@@ -576,8 +577,11 @@ def _follow(
             for t in range(start, stop)[::step] if first >= 0 else ():
                 there = np.flatnonzero(known[t])
                 sd = length_mm * (_PLACE_SHARE + np.abs(seconds[t] - last_s))[:, None]
-                off = np.linalg.norm(last[:, None] - places[t, there], axis=-1)
-                cost = (off / sd) ** 2 + 2.0 * np.log(sd) + 2.0 * misfit[t][:, there]
+                away = last[:, None] - places[t, there]
+                # raised bodies fit wrongly
+                covers = (np.linalg.norm(away[..., :2], axis=-1) < length_mm).sum(axis=0) > 1
+                fit = np.where(covers, 0.0, misfit[t][:, there])
+                cost = (np.linalg.norm(away, axis=-1) / sd) ** 2 + 2.0 * (np.log(sd) + fit)
                 for _ in there:
                     animal, one = np.unravel_index(np.argmin(cost), cost.shape)
                     way[t - start, animal] = there[one]
@@ -674,7 +678,7 @@ class OnlineIdentity:
         self._last_s[shown] = now_s
         to, of = ((2 * k[:, None] + (0, 1)).ravel() for k in (shown, best[shown]))
         self._last.times_ns[:] = first.times_ns
-        for name in _OF_COMPONENTS:
+        for name in OF_COMPONENTS:
             getattr(self._last, name)[:, to] = getattr(first, name)[:, of]
         slots = np.where(known[best], best, NONE)
         own = [

@@ -28,7 +28,7 @@ import numpy as np
 from liex_lab.arrays import Mask, NDArray
 from liex_lab.body.skeleton import VIEWS
 from liex_lab.errors import EstimationError
-from liex_lab.estimation.estimator import PoseEstimator
+from liex_lab.estimation.estimator import Detection, PoseEstimator
 from liex_lab.recordings.frame import DepthFrame, has_readings, stacked
 from liex_lab.runtime.kernels import kernel
 from liex_lab.runtime.processes import in_parallel, threads
@@ -36,7 +36,6 @@ from liex_lab.scene._blob_kernels import N_PX, SLOPE, back_slope, blob_moments
 from liex_lab.scene.background_segmenter import BackgroundSubtraction
 from liex_lab.scene.height_maps import ANIMAL_HEIGHTS, N_OBJECTS, HeightMaps, view_of
 from liex_lab.tracking.observations import Array, Observations
-from liex_lab.tracking.residual import render_crops
 from liex_lab.tracking.tracker import FrameTracker
 
 Labels = NDArray[np.int8]  # of pixels: the animal's number, -1 for none
@@ -124,12 +123,28 @@ class JointTracker:
         return self.trackers[0].estimator
 
     @cached_property
-    def _bodies(self) -> list[FrameTracker]:
+    def bodies(self) -> list[FrameTracker]:
         """The trackers, each once."""
         return list({id(tracker): tracker for tracker in self.trackers}.values())
 
     @cached_property
-    def _least_mm2(self) -> float:
+    def body_of(self) -> NDArray[np.int64]:
+        """(N,) which of the bodies is that of each animal."""
+        return np.array([self.bodies.index(tracker) for tracker in self.trackers])
+
+    @cached_property
+    def usual_mm(self) -> Array:
+        """The usual mean height of each body from the floor, mm."""
+        return np.array([self.heights_mm[self.trackers.index(body)] for body in self.bodies])
+
+    @cached_property
+    def most_off_mm(self) -> float:
+        """The largest distance of a pixel from the bodies that counts, mm."""
+        return _MOST_OFF * float(np.sqrt(self.trackers[-1].scene.area_mm2))
+
+    @cached_property
+    def least_mm2(self) -> float:
+        """The least area of a part of a component that is an animal, mm^2."""
         return _LEAST_AREA * min(tracker.scene.area_mm2 for tracker in self.trackers)
 
     def observe(self, frames: Sequence[DepthFrame]) -> list[Observations]:
@@ -145,13 +160,11 @@ class JointTracker:
         depths = stacked(frames)
         times = np.array([frame.time_ns for frame in frames], np.int64)
         with threads(len(frames) > 1):
-            crops = self.scene.extract(
-                depths, self._size, camera_view=self._camera_view, n_candidates=N_OBJECTS
-            )
+            crops = self.components(depths)
             parts = self._parts(crops, depths)
             cleared = self.scene.cleared(depths)
             found = {}
-            for body in self._bodies:
+            for body in self.bodies:
                 observed = Observations.empty(self.estimator.skeleton, times, len(self.trackers))
                 observed.has_depth[:] = [has_readings(depth) for depth in depths]
                 observed.repeats[:] = [frame.repeats for frame in frames]
@@ -162,8 +175,15 @@ class JointTracker:
                 found[id(body)] = observed
         return [found[id(tracker)] for tracker in self.trackers]
 
+    def components(self, depths: NDArray[np.float32]) -> HeightMaps:
+        """The components of depth images (n, H, W) mm: N_OBJECTS n rows, component by component."""
+        return self.scene.extract(
+            depths, self._size, camera_view=self.camera_view, n_candidates=N_OBJECTS
+        )
+
     @property
-    def _camera_view(self) -> bool:
+    def camera_view(self) -> bool:
+        """Whether heights are measured from behind the animal, see `BackgroundSubtraction`."""
         return self.estimator.model.method.camera_view
 
     @property
@@ -180,12 +200,16 @@ class JointTracker:
     ) -> None:
         """Set the hypotheses of all parts (N n rows, part by part) with the body of one animal."""
         n = len(observed)
-        cameras = self.scene.crop_cameras(parts, self._camera_view)
-        whole = self.estimator.candidates(parts, cameras, body.size)
+        whole = self.candidates(body, parts)
         detections = [whole[k * n : (k + 1) * n] for k in range(len(self.trackers))]
         hypotheses = self.estimator.both_directions(detections, body.size)
         poses = [body.put(observed, h, some, depths) for h, some in enumerate(hypotheses)]
         body.put_agreement(observed, hypotheses, poses, cleared)
+
+    def candidates(self, body: FrameTracker, parts: HeightMaps) -> Detection:
+        """The candidate poses of a body in each part (k rows)."""
+        cameras = self.scene.crop_cameras(parts, self.camera_view)
+        return self.estimator.candidates(parts, cameras, body.size)
 
     def _parts(self, crops: HeightMaps, depths: NDArray[np.float32]) -> HeightMaps:
         """The height map of each animal, as far as it is in view: N n rows, part by part.
@@ -220,7 +244,7 @@ class JointTracker:
     def _are_animals(self, crops: HeightMaps) -> Mask:
         """Which components (n,) are as large and high as one of the animals or several of them."""
         area = np.where(crops.found, crops.blobs.area_mm2, 0.0)
-        right = area >= self._least_mm2
+        right = area >= self.least_mm2
         if self.scene.view.frame == VIEWS[0]:  # swimming animals are at any height
             height = crops.blobs.volume_mm3 / np.maximum(area, 1e-9)
             least, most = ANIMAL_HEIGHTS
@@ -235,15 +259,15 @@ class JointTracker:
         for image, mask, step in zip(left, scene.animal_masks(crops), crops.step, strict=True):
             own = cv2.dilate(mask.astype(np.uint8), np.ones((2 * step // scene.stride + 1,) * 2))
             image[own > 0] = scene.background[own > 0]
-        return scene.extract(left, self._size, camera_view=self._camera_view)
+        return scene.extract(left, self._size, camera_view=self.camera_view)
 
     def _explain(self, blobs: HeightMaps, m: int) -> tuple[HeightMaps, Mask]:
         """Cut components (q rows) into the parts of m animals each: m q rows, part by part; and
         whether (q,) they are so many animals.
         """
-        q, n_bodies = len(blobs.n_px), len(self._bodies)
+        q, n_bodies = len(blobs.n_px), len(self.bodies)
         rows = np.arange(q)
-        observed = self._observed(blobs)
+        observed = self.depth_of(blobs)
         labels, bodies = self._cuts(blobs, m)
         on_floor = np.zeros(bodies.shape[:2])
         cost, drawn, shown = self._tried(blobs, observed, labels, bodies, on_floor)
@@ -259,7 +283,7 @@ class JointTracker:
             kept_cost = np.where(better, again[:, 0], kept_cost)
             kept = np.where(better[:, None, None], now, kept)
             shown = fresh[:, 0]
-        largest_mm2 = max(body.scene.area_mm2 for body in self._bodies)
+        largest_mm2 = max(body.scene.area_mm2 for body in self.bodies)
         several = (kept_cost < _CLEAR) & (blobs.blobs.area_mm2 > _TORN * largest_mm2)
         on_top, up_mm = np.zeros(q, np.bool_), np.zeros((m, q))
         if len(some := np.flatnonzero(~several)):
@@ -271,8 +295,8 @@ class JointTracker:
             up_mm[0, some] = np.where(on_top[some], raised_mm[upper], 0.0)
             kept[on_top] = labels[upper][on_top[some]]
         mine = np.concatenate([kept == j for j in range(m)])
-        split = self._cut(HeightMaps.join([blobs] * m), mine, up_mm.ravel())
-        enough = split.blobs.area_mm2.reshape(m, q) > 0.6 * self._least_mm2
+        split = self.cut(HeightMaps.join([blobs] * m), mine, up_mm.ravel())
+        enough = split.blobs.area_mm2.reshape(m, q) > 0.6 * self.least_mm2
         split.n_px[~enough.ravel()] = 0
         return split, on_top | several & enough.all(axis=0)
 
@@ -287,16 +311,16 @@ class JointTracker:
             Labels (q, 2 B, S, S), 0 on the animal; the body (q, 2 B, m) of each part, -1 for none,
             and how far (q, 2 B) the animal is raised, mm.
         """
-        n_bodies = len(self._bodies)
+        n_bodies = len(self.bodies)
         labels = np.where(blobs.heights > 0, np.int8(0), np.int8(-1))[:, None]
         labels = labels.repeat(2 * n_bodies, axis=1)
         bodies = np.full((*labels.shape[:2], m), -1)
         bodies[:, :n_bodies, 0] = np.arange(n_bodies)
         up_mm = np.zeros(labels.shape[:2])
-        for i, heights in enumerate(blobs.heights if m == 2 and not self._camera_view else ()):
+        for i, heights in enumerate(blobs.heights if m == 2 and not self.camera_view else ()):
             ordered = np.sort(heights[heights > 0])
-            for k, body in enumerate(self._bodies):
-                usual_mm = self.heights_mm[self.trackers.index(body)]
+            for k, body in enumerate(self.bodies):
+                usual_mm = self.usual_mm[k]
                 lower = max(1.0 - body.scene.area_mm2 / blobs.blobs.area_mm2[i], 0.0)
                 least = ordered[int(np.ceil(lower * (len(ordered) - 1)))]
                 raised_mm = ordered[ordered >= least].mean() / 16.0 - usual_mm
@@ -308,11 +332,10 @@ class JointTracker:
     def _cuts(self, blobs: HeightMaps, m: int) -> tuple[Labels, NDArray[np.int64]]:
         """Labels (q, P, S, S) of the parts in P ways of cutting, and the body (q, P, m) of each."""
         areas = np.array([tracker.scene.area_mm2 for tracker in self.trackers])
-        bodies = np.array([self._bodies.index(tracker) for tracker in self.trackers])
         # of animals of two sizes either may be on either side: on a floor, volumes decide
         chosen = np.arange(len(areas)) if len(areas) == m else np.arange(m)
-        n_sides = 1 if len(self._bodies) == 1 else 2
-        n_ways = _N_DIRECTIONS * (n_sides if self._camera_view else 1)
+        n_sides = 1 if len(self.bodies) == 1 else 2
+        n_ways = _N_DIRECTIONS * (n_sides if self.camera_view else 1)
         angles = np.arange(_N_DIRECTIONS * n_sides) * np.pi / _N_DIRECTIONS
         share = np.cumsum(areas[chosen]) / areas[chosen].sum()
         volumes = (areas * self.heights_mm)[chosen]
@@ -331,16 +354,16 @@ class JointTracker:
                 off = np.abs(of_first - volumes[0] / volumes.sum()).reshape(n_sides, n_ways)
                 parts = parts.reshape(n_sides, n_ways, -1)[off.argmin(axis=0), np.arange(n_ways)]
             own[:, v, u] = parts
-        return labels, np.tile(bodies[chosen], (len(labels), n_ways, 1))
+        return labels, np.tile(self.body_of[chosen], (len(labels), n_ways, 1))
 
-    def _cut(self, parts: HeightMaps, mine: Mask, up_mm: Array) -> HeightMaps:
+    def cut(self, parts: HeightMaps, mine: Mask, up_mm: Array) -> HeightMaps:
         """The same height maps (k rows) without the pixels that are not `mine` (k, S, S), each
         measured from up_mm (k,) above the floor; in place.
         """
         parts.heights[:] *= mine
-        behind_mm = self.scene.view.behind_mm if self._camera_view else 0.0
+        behind_mm = self.scene.view.behind_mm if self.camera_view else 0.0
         lift = -up_mm
-        if self._camera_view:  # heights are measured from behind the middle of each part
+        if self.camera_view:  # heights are measured from behind the middle of each part
             n_px = np.maximum(mine.sum(axis=(1, 2)), 1)
             lift += behind_mm - parts.heights.sum(axis=(1, 2)) / 16.0 / n_px
         moved = np.flatnonzero(lift)
@@ -351,9 +374,9 @@ class JointTracker:
         in_parallel(
             _measure_parts,
             len(parts.n_px),
-            self.scene.planes(parts, self._camera_view),
+            self.scene.planes(parts, self.camera_view),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-            self.scene.view_rotation(self._camera_view),
+            self.scene.view_rotation(self.camera_view),
             behind_mm,
             parts.rows,
         )
@@ -377,27 +400,34 @@ class JointTracker:
         q, p, m = bodies.shape
         ways = labels.reshape(q * p, *labels.shape[2:])
         which, part, way = np.nonzero(
-            np.arange(len(self._bodies))[:, None, None] == bodies.reshape(q * p, m).T
+            np.arange(len(self.bodies))[:, None, None] == bodies.reshape(q * p, m).T
         )
         up_mm = np.where(part == 0, raised_mm.ravel()[way], 0.0)
-        parts = self._cut(blobs[way // p], ways[way] == part[:, None, None], up_mm)
+        parts = self.cut(blobs[way // p], ways[way] == part[:, None, None], up_mm)
         drawn = np.zeros((len(way) + 1, *ways.shape[1:]), np.float32)
-        for k, body in enumerate(self._bodies):
+        for k, body in enumerate(self.bodies):
             rows = slice(*np.searchsorted(which, (k, k + 1)))
-            self._draw(body, parts[rows], drawn[rows])
+            self.draw(body, parts[rows], drawn[rows])
         shown = np.full((q * p, m), -1)
         shown[way, part] = np.arange(len(way))
-        cost = np.empty(q * p)
-        most_mm = _MOST_OFF * float(np.sqrt(self.trackers[-1].scene.area_mm2))
-        in_parallel(_explained, q * p, observed, drawn, shown, most_mm, cost)
+        cost = self.costs(observed, drawn, shown)
         cost[way[~parts.found]] = np.inf
         cost[(shown < 0).all(axis=1)] = np.inf
         return cost.reshape(q, p), drawn, shown.reshape(q, p, m)
 
-    def _draw(self, body: FrameTracker, parts: HeightMaps, drawn: NDArray[np.float32]) -> None:
+    def costs(
+        self, observed: NDArray[np.float32], drawn: NDArray[np.float32], shown: NDArray[np.int64]
+    ) -> Array:
+        """The costs (q P,) of explaining depth (q, S, S) mm in P ways each by bodies (r, S, S) mm,
+        those numbered shown (q P, m), see the module.
+        """
+        cost = np.empty(len(shown))
+        in_parallel(_explained, len(shown), observed, drawn, shown, self.most_off_mm, cost)
+        return cost
+
+    def draw(self, body: FrameTracker, parts: HeightMaps, drawn: NDArray[np.float32]) -> None:
         """Render the best pose of a body in each part (k rows) into `drawn` (k, S, S) mm."""
-        cameras = self.scene.crop_cameras(parts, self._camera_view)
-        found = self.estimator.candidates(parts, cameras, body.size)
+        found = self.candidates(body, parts)
         some = np.flatnonzero(found.usable)
         if len(some):
             found = found[some]
@@ -406,13 +436,12 @@ class JointTracker:
             if body.shape is not None:
                 pose = body.shape.corrected(self.estimator, pose, body.size)
             pose = pose.moved(self.scene.floor.T_arena_camera)
-            across = body.body.across(pose.scale)
-            drawn[some] = render_crops(body.body.surface, pose, across, found.crops, self.scene)
+            drawn[some] = body.body.rendered(pose, found.crops, self.scene)
 
-    def _observed(self, blobs: HeightMaps) -> NDArray[np.float32]:
+    def depth_of(self, blobs: HeightMaps) -> NDArray[np.float32]:
         """Depth (q, S, S) mm of components, 0 outside."""
         size = blobs.heights.shape[1]
-        a, b, c = self.scene.planes(blobs, self._camera_view).T[:, :, None, None]
+        a, b, c = self.scene.planes(blobs, self.camera_view).T[:, :, None, None]
         pixel = np.arange(size) * blobs.step[:, None]
         u = (blobs.origin[:, :1] + pixel)[:, None, :]
         v = (blobs.origin[:, 1:] + pixel)[:, :, None]

@@ -8,7 +8,8 @@ is hypothesis h with head and tail exchanged. The fields are the columns of `obs
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -143,6 +144,15 @@ class Observations(Rows):
         """(n, H) True if the hypothesis exists."""
         return np.isfinite(self.score)
 
+    def copied(self, allocate: Allocator) -> Observations:
+        """The same observations in columns of their own, made by `allocate`."""
+        columns: dict[str, Any] = {}
+        for name in COLUMNS:
+            values = getattr(self, name)
+            columns[name] = allocate(values.shape, values.dtype)
+            columns[name][:] = values
+        return replace(self, **columns)
+
     def forget(self, copies: NDArray[np.bool_]) -> None:
         """Clear, in place, the observations of frames (n,) whose depth image is a copy."""
         nothing = Observations.empty(self.skeleton, self.times_ns, self.score.shape[1] // 2)
@@ -245,6 +255,7 @@ def joints_of(skeleton: Skeleton, pose: Pose) -> Array:
 
 _BLOCK = 4096
 COLUMNS = tuple(field.name for field in fields(Observations) if field.name != "skeleton")
+OF_COMPONENTS = {*COLUMNS} - {"times_ns", "has_depth", "repeats", "objects"}
 
 
 def reversed_pose(skeleton: Skeleton, pose: Pose) -> Pose:

@@ -105,8 +105,7 @@ class BodyResidual:
         out = np.empty((4, len(pose_arena.scale)))
         if not out.size:
             return BodyAgreement(*out)
-        across = self.across(pose_arena.scale)
-        rendered = render_crops(self.surface, pose_arena, across, crops, scene)
+        rendered = self.rendered(pose_arena, crops, scene)
         planes = scene.planes(crops, self.camera_view)
         joints = scene.camera.project(
             scene.floor.T_arena_camera.inverse() @ joints_of(self.surface.skeleton, pose_arena)
@@ -124,6 +123,13 @@ class BodyResidual:
             out,
         )
         return BodyAgreement(*out)
+
+    def rendered(
+        self, pose_arena: Pose, crops: HeightMaps, scene: Segmenter
+    ) -> NDArray[np.float32]:
+        """The body's depth on the pixels of n height maps, see `render_crops`."""
+        across = self.across(pose_arena.scale)
+        return render_crops(self.surface, pose_arena, across, crops, scene)
 
     @staticmethod
     def fit(
