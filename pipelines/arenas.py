@@ -302,6 +302,7 @@ def _measure_animals(
         identity = identify(whole, subjects, readings)
         stretches = covered_stretches(whole, subjects[0].length_mm)
         if stretches and not joint.camera_view:
+            progress(0, None, "explaining frames in which animals cover each other")
             pairs = zip(whole, writers, strict=True)
             whole = [one.copied(writer.allocate) for one, writer in pairs]
             for rows, near in stretches:

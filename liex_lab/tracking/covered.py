@@ -33,6 +33,7 @@ _NEARER = 0.5  # of the largest distance from the depth: what is nearer is not t
 _RAISED = 0.15  # how much higher than usual a raised animal is, in its usual heights
 _SEEN = 0.05  # least visible share of a held animal
 _GOOD = 2.0  # residual of poses to hold, over the usual one
+_REACH = 2.0  # of animals that cover each other, from where they were in view, lengths
 _CHANGE = 0.3  # cost of another animal being the lower one
 _BOTH = 1.25  # cost with a pose of both over that with one, which it may have
 
@@ -174,12 +175,14 @@ def _ways(
         off = np.linalg.norm(middles[:, i, None] - place[row, there], axis=-1)
         of_blob, missing = off.argmin(axis=0), np.flatnonzero(~known)
         for side, anchor in enumerate(near[i]):
+            lay = place[anchor, slots[anchor]]
             for k in range(n_animals if anchor != NONE else 0):
-                lay = place[anchor, slots[anchor, k]]
-                blob = np.linalg.norm(middles[:, i] - lay, axis=-1).argmin()
+                blob = np.linalg.norm(middles[:, i] - lay[k], axis=-1).argmin()
                 pair = there[of_blob == blob]
                 pair = np.append(pair, missing[:1]) if len(pair) == 1 else pair
-                for body in range(len(joint.bodies)) if len(pair) == 2 else ():
+                away = np.linalg.norm(middles[blob, i] - lay, axis=-1) / joint.trackers[0].spine_mm
+                together = away[k] < 1.0 and (away < _REACH).sum() > 1 and len(pair) == 2
+                for body in range(len(joint.bodies)) if together else ():
                     ways.append((i, side, anchor, k, body, blob * q + i, *pair))
     columns = np.array(ways, np.int64).reshape(-1, 8)
     frame, side, anchor, lower, body, blob = columns[:, :6].T

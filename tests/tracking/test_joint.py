@@ -11,7 +11,10 @@ from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
 from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.catalogue import film
+from liex_lab.tracking.covered import covered_stretches, look_again
+from liex_lab.tracking.identity import identify
 from liex_lab.tracking.joint import JointTracker
+from liex_lab.tracking.observations import COLUMNS, Observations
 
 TOUCH = slice(50, 58)
 ON_TOP = slice(40, 44)
@@ -45,7 +48,14 @@ def joint(recording: RenderedRecording) -> JointTracker:
 
 def errors(recording: RenderedRecording, joint: JointTracker, rows: slice) -> np.ndarray:
     """(2, n, 2) mm between each animal and each component's better direction, NaN if unseen."""
-    seen = joint.observe([recording.frame(k) for k in range(rows.start, rows.stop)])[0]
+    frames = [recording.frame(k) for k in range(rows.start, rows.stop)]
+    return off_mm(recording, joint, rows, joint.observe(frames)[0])
+
+
+def off_mm(
+    recording: RenderedRecording, joint: JointTracker, rows: slice, seen: Observations
+) -> np.ndarray:
+    """`errors` of the observations of some frames."""
     inverse = recording.stage.scene.T_arena_camera @ joint.scene.floor.T_arena_camera.inverse()
     joints = inverse @ np.stack(
         [seen.joints_as(h, range(seen.skeleton.n_joints)) for h in range(4)], axis=1
@@ -74,6 +84,31 @@ def test_an_animal_on_top_of_another_is_measured_where_it_is(
 ) -> None:
     upper = errors(recording, joint, ON_TOP)[1]
     assert np.nanmin(upper, axis=1).max() < 12.0
+
+
+def test_an_animal_that_another_one_covers_is_held_where_it_lay(
+    recording: RenderedRecording, joint: JointTracker
+) -> None:
+    rows = slice(24, 58)
+    frames = [recording.frame(k) for k in range(rows.start, rows.stop)]
+    seen = joint.observe(frames)
+    before = [one.copied(np.empty) for one in seen]
+    length_mm = joint.trackers[0].spine_mm
+    slots = identify(seen, [tracker.subject for tracker in joint.trackers]).slots
+    stretches = covered_stretches(seen, length_mm)
+    on_top = np.arange(ON_TOP.start, ON_TOP.stop) - rows.start
+    assert np.isin(on_top, np.concatenate([some for some, _ in stretches])).all()
+    for some, near in stretches:
+        look_again(joint, [frames[k] for k in some], some, near, seen, slots)
+    best = off_mm(recording, joint, rows, seen[0])[:, on_top]
+    assert best[1, :, 0].max() < 12.0  # the upper one
+    assert best[0, :, 1].max() < 10.0  # the lower one
+    # what is hidden is not evidence
+    assert (seen[0].n_px[on_top, 2] < 0.5 * seen[0].n_px[on_top, 0]).all()
+    others = np.setdiff1d(np.arange(len(frames)), np.concatenate([some for some, _ in stretches]))
+    for name in COLUMNS:
+        for one, was in zip(seen, before, strict=True):
+            np.testing.assert_array_equal(getattr(one, name)[others], getattr(was, name)[others])
 
 
 def test_more_animals_than_stand_apart_are_refused(
