@@ -20,18 +20,15 @@ from liex_lab.runtime.memory import Rows
 from liex_lab.runtime.processes import threads
 from liex_lab.scene.height_maps import HeightMaps
 from liex_lab.tracking.association import NONE
-from liex_lab.tracking.identity import Slots, fitting, viterbi
+from liex_lab.tracking.identity import Slots, covering, fitting, viterbi
 from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.observations import OF_COMPONENTS, Array, Observations
 from liex_lab.tracking.trust import finite_median
 
-_COVERED = 0.35  # hidden area, in animals, of animals that cover each other
-_WHOLE = 0.15  # that of animals that do not
 _HELD_S = 5.0  # longest time from a frame that shows all animals
 _MOST_WAYS = 512  # of explaining the frames of a stretch
 _NEARER = 0.5  # of the largest distance from the depth: what is nearer is not the lower animal
 _RAISED = 0.15  # how much higher than usual a raised animal is, in its usual heights
-_SEEN = 0.05  # least visible share of a held animal
 _GOOD = 2.0  # residual of poses to hold, over the usual one
 _REACH = 2.0  # of animals that cover each other, from where they were in view, lengths
 _CHANGE = 0.3  # cost of another animal being the lower one
@@ -76,25 +73,21 @@ def covered_stretches(
     """
     observed = every[0]
     known = observed.known[:, ::2]
-    n_animals = known.shape[1]
-    touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < n_animals
-    shown = np.where(known, observed.n_px[:, ::2], 0).sum(axis=1)
-    apart = known.all(axis=1) & ~touching
-    usual = finite_median(shown[apart], 0.0) / n_animals
+    touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < len(every)
     fits = np.any([fitting(one, length_mm) for one in every], axis=0).all(axis=1)
-    covered = touching & known.any(axis=1) & ~(fits & (shown > (n_animals - _COVERED) * usual))
+    fits &= ~covering(observed, touching, None)
     off_mm = np.min([one.residual_mm[:, ::2] for one in every], axis=0)
-    good = (off_mm < _GOOD * finite_median(off_mm[apart], 0.0)).all(axis=1)
-    whole = good & fits & (shown > (n_animals - _WHOLE) * usual)
+    usual_mm = finite_median(off_mm[fits & ~touching], 0.0)
+    whole = fits & (off_mm < _GOOD * usual_mm).all(axis=1)
     anchors, seconds = np.pad(np.flatnonzero(whole), 1, constant_values=NONE), observed.seconds
-    rows = np.flatnonzero(covered)
+    rows = np.flatnonzero(touching & known.any(axis=1) & ~fits)
     after = 1 + np.searchsorted(anchors[1:-1], rows)
     near = np.stack([anchors[after - 1], anchors[after]], axis=1)
     near[np.abs(seconds[near] - seconds[rows][:, None]) > _HELD_S] = NONE
     some = (near != NONE).any(axis=1)
     rows, near = rows[some], near[some]
     cuts = np.flatnonzero((np.diff(rows) > 1) | (np.diff(near, axis=0) != 0).any(axis=1)) + 1
-    most = _MOST_WAYS // (2 * n_animals**2)
+    most = _MOST_WAYS // (2 * len(every) ** 2)
     stretches = np.split(np.arange(len(rows)), cuts)
     pieces = [one[at : at + most] for one in stretches for at in range(0, len(one), most)]
     return [(rows[piece], near[piece]) for piece in pieces]
@@ -126,9 +119,8 @@ def look_again(
         if not len(ways.frame):
             return
         blobs = crops[ways.blob]
-        names = np.full((len(rows), len(observed)), NONE)
-        for k, own in enumerate(slots[rows].T):
-            names[own != NONE, own[own != NONE]] = k
+        names = np.full((len(rows), len(observed) + 1), NONE)  # NONE is the last column
+        np.put_along_axis(names, slots[rows], np.arange(len(observed))[None], axis=1)
         held = slots[ways.anchor, ways.lower]
         lower = _drawn(joint, observed, ways.lower, ways.anchor, held, blobs)
         depth = joint.depth_of(blobs)
@@ -142,17 +134,12 @@ def look_again(
             for own in ways.components.T
         ]
         as_is = _cost(joint, depth, *now)
-        shown_px = (inside & ~above).sum(axis=(1, 2)) * blobs.step**2
-        seen = shown_px > _SEEN * observed[0].n_px[ways.anchor, 2 * held]
         both = ~observed[0].known[rows[ways.frame], 2 * ways.components[:, 1]]
         best = _best(ways, cost - np.where(both, _BOTH, 1.0) * as_is, len(rows))
         if len(best):
-            some, drawn = ways[best], lower[best] > 0
             below = joint.cut(blobs[best], (inside & ~above)[best], np.zeros(len(best)))
-            beside = (drawn & ~inside[best]).sum(axis=(1, 2)) / drawn.sum(axis=(1, 2))
-            beside[~seen[best]] = 1.0
-            row, depths = rows[some.frame], depths[some.frame]
-            _put(joint, observed, row, some, held[best], tops[best], below, beside, depths)
+            some, row = ways[best], rows[ways.frame[best]]
+            _put(joint, observed, row, some, held[best], tops[best], below, depths[some.frame])
 
 
 def _ways(
@@ -264,13 +251,12 @@ def _put(
     held: NDArray[np.int64],
     tops: HeightMaps,
     below: HeightMaps,
-    beside: Array,
     depths: NDArray[np.float32],
 ) -> None:
     """Put the upper animals, measured in `tops`, and the held ones into rows (k,) of observations.
 
     The held ones, components `held` (k,) of the frames they are held from, are compared with what
-    of them is visible, `below`; `beside` (k,) is 1 where that is too little.
+    of them is visible, `below`: a hidden pose does not fit.
     """
     cleared = joint.scene.cleared(depths)
     below.n_px[:] = np.maximum(below.n_px, 1)
@@ -283,12 +269,11 @@ def _put(
         for name in OF_COMPONENTS:
             getattr(own, name)[:, 2:] = getattr(out, name)[ways.anchor[:, None], of]
         own.n_px[:, 2:] = below.n_px[:, None]
-        seen = own.known[:, 2:] & (beside < 1.0)[:, None]
+        seen = own.known[:, 2:].T
         lower = [
-            replace(one, found=there, crops=below) for one, there in zip(upper, seen.T, strict=True)
+            replace(one, found=there, crops=below) for one, there in zip(upper, seen, strict=True)
         ]
         poses += [own.pose(np.full(len(own), 2 + h)) for h in range(2)]
         tracker.put_agreement(own, [*upper, *lower], poses, cleared)
-        own.beside[:, 2:] = beside[:, None]
         for name in OF_COMPONENTS:
             getattr(out, name)[rows[:, None], to] = getattr(own, name)

@@ -102,7 +102,7 @@ def identify(
         bodies = np.stack([_misfit(one)[full] for one in observed])
         apart, weight = _independent(observed[0][full])
         shown = np.any([fitting(one[full], subjects[0].length_mm) for one in observed], axis=0)
-        shown &= ~_covering(observed[0][full], ~apart, None)[:, None]
+        shown &= ~covering(observed[0][full], ~apart, None)[:, None]
         fits = _fits(bodies, apart, weight * shown.all(axis=1), states)
         path, _ = viterbi(transition, fits)
         size = np.log(np.maximum(observed[0].n_px[full, ::2], 1))
@@ -221,7 +221,7 @@ def own_observations(
             for h in range(2):
                 out[rows, h] = values[rows, 2 * slots[rows] + h]
     touching = np.isfinite(observed.objects[..., 0]).sum(axis=1) < observed.score.shape[1] // 2
-    own.behind[touching, :2] = _covering(observed, touching, usual_px)[touching, None]
+    own.behind[touching, :2] = covering(observed, touching, usual_px)[touching, None]
     # of an outline that a neighbour cuts, the metric does not know which end is the head
     touching &= own.known[:, 0] & own.known[:, 1]
     for values in (own.score, own.error_mm):
@@ -229,7 +229,7 @@ def own_observations(
     return own
 
 
-def _covering(
+def covering(
     observed: Observations, touching: NDArray[np.bool_], usual_px: float | None
 ) -> NDArray[np.bool_]:
     """Whether (n,) touching animals cover each other: all in view show too little together."""
