@@ -31,7 +31,7 @@ from liex_lab.recordings.timestamps import unwritable_times
 from liex_lab.runtime import durable, processes
 from liex_lab.runtime.progress import Progress, reporting_compilation, silent
 from liex_lab.scene.zones import masks_apart
-from liex_lab.tracking.covered import covered_stretches, look_again
+from liex_lab.tracking.covered import covered_stretches, measure_covered
 from liex_lab.tracking.identity import covers, identify, own_observations
 from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.observations import Observations
@@ -303,11 +303,10 @@ def _measure_animals(
         stretches = covered_stretches(whole, subjects[0].length_mm)
         if stretches and not joint.camera_view:
             progress(0, None, "explaining frames in which animals cover each other")
-            pairs = zip(whole, writers, strict=True)
-            whole = [one.copied(writer.allocate) for one, writer in pairs]
+            whole = [one.copied(to.allocate) for one, to in zip(whole, writers, strict=True)]
             for rows, near in stretches:
                 frames = [shared.frame(int(row)) for row in rows]
-                look_again(joint, frames, rows, near, whole, identity.slots)
+                measure_covered(joint, frames, rows, near, whole, identity.slots)
             identity = identify(whole, subjects, readings)
         alone = [own_observations(one, identity.slots[:, k]) for k, one in enumerate(whole)]
         covering = covers(alone, subjects[0].length_mm)

@@ -41,21 +41,21 @@ class _Ways(Rows):
 
     Attributes:
         frame: (w,) number of the frame.
-        side: (w,) 0, held from before; 1, from after.
         anchor: (w,) row of the frame from which the lower animal is held.
         lower: (w,) that animal.
         body: (w,) the body of the upper one.
         blob: (w,) row of the height map of both.
-        components: (w, 2) which the upper and the lower one become.
+        over: (w,) the component that the upper one becomes.
+        under: (w,) that of the lower one.
     """
 
     frame: NDArray[np.int64]
-    side: NDArray[np.int64]
     anchor: NDArray[np.int64]
     lower: NDArray[np.int64]
     body: NDArray[np.int64]
     blob: NDArray[np.int64]
-    components: NDArray[np.int64]
+    over: NDArray[np.int64]
+    under: NDArray[np.int64]
 
 
 def covered_stretches(
@@ -69,7 +69,7 @@ def covered_stretches(
 
     Returns:
         For each the rows (q,) of its frames, cut where they are many, and of the nearest frames
-        (q, 2) before and after that show all animals, `NONE` if there is none within 5 s.
+        (q, 2) before and after that show all animals, `NONE` without one within 5 s.
     """
     observed = every[0]
     known = observed.known[:, ::2]
@@ -93,7 +93,7 @@ def covered_stretches(
     return [(rows[piece], near[piece]) for piece in pieces]
 
 
-def look_again(
+def measure_covered(
     joint: JointTracker,
     frames: Sequence[DepthFrame],
     rows: NDArray[np.int64],
@@ -131,10 +131,10 @@ def look_again(
         cost[~lower.any(axis=(1, 2)) | ~upper.any(axis=(1, 2))] = np.inf
         now = [
             _drawn(joint, observed, names[ways.frame, own], rows[ways.frame], own, blobs)
-            for own in ways.components.T
+            for own in (ways.over, ways.under)
         ]
         as_is = _cost(joint, depth, *now)
-        both = ~observed[0].known[rows[ways.frame], 2 * ways.components[:, 1]]
+        both = ~observed[0].known[rows[ways.frame], 2 * ways.under]
         best = _best(ways, cost - np.where(both, _BOTH, 1.0) * as_is, len(rows))
         if len(best):
             below = joint.cut(blobs[best], (inside & ~above)[best], np.zeros(len(best)))
@@ -161,7 +161,7 @@ def _ways(
         there = np.flatnonzero(known)
         off = np.linalg.norm(middles[:, i, None] - place[row, there], axis=-1)
         of_blob, missing = off.argmin(axis=0), np.flatnonzero(~known)
-        for side, anchor in enumerate(near[i]):
+        for anchor in near[i]:
             lay = place[anchor, slots[anchor]]
             for k in range(n_animals if anchor != NONE else 0):
                 blob = np.linalg.norm(middles[:, i] - lay[k], axis=-1).argmin()
@@ -170,10 +170,8 @@ def _ways(
                 away = np.linalg.norm(middles[blob, i] - lay, axis=-1) / joint.trackers[0].spine_mm
                 together = away[k] < 1.0 and (away < _REACH).sum() > 1 and len(pair) == 2
                 for body in range(len(joint.bodies)) if together else ():
-                    ways.append((i, side, anchor, k, body, blob * q + i, *pair))
-    columns = np.array(ways, np.int64).reshape(-1, 8)
-    frame, side, anchor, lower, body, blob = columns[:, :6].T
-    return _Ways(frame, side, anchor, lower, body, blob, columns[:, 6:])
+                    ways.append((i, anchor, k, body, blob * q + i, *pair))
+    return _Ways(*np.array(ways, np.int64).reshape(-1, 7).T)
 
 
 def _drawn(
@@ -209,9 +207,8 @@ def _on_top(
     the usual one.
     """
     n_px = np.maximum(above.sum(axis=(1, 2)), 1)
-    mean_mm = np.where(above, blobs.heights, 0).sum(axis=(1, 2)) / 16.0 / n_px
     usual_mm = joint.usual_mm[bodies]
-    up_mm = mean_mm - usual_mm
+    up_mm = np.where(above, blobs.heights, 0).sum(axis=(1, 2)) / 16.0 / n_px - usual_mm
     up_mm[up_mm < _RAISED * usual_mm] = 0.0
     tops = joint.cut(blobs[np.arange(len(n_px))], above, up_mm)
     drawn = np.zeros(blobs.heights.shape, np.float32)
@@ -231,7 +228,7 @@ def _best(ways: _Ways, off: Array, q: int) -> NDArray[np.int64]:
         off: (w,) how much more each costs than the explanation of its frame alone.
         q: frames.
     """
-    kinds = np.stack([ways.side, ways.lower], axis=1)
+    kinds = np.stack([ways.anchor, ways.lower], axis=1)
     states, state = np.unique(kinds, axis=0, return_inverse=True)
     least = np.zeros((q, len(states)))
     np.minimum.at(least, (ways.frame, state), off)
@@ -260,7 +257,7 @@ def _put(
     """
     cleared = joint.scene.cleared(depths)
     below.n_px[:] = np.maximum(below.n_px, 1)
-    to = (2 * ways.components[..., None] + (0, 1)).reshape(-1, 4)
+    to = 2 * np.stack([ways.over, ways.over, ways.under, ways.under], axis=1) + (0, 1, 0, 1)
     of = 2 * held[:, None] + (0, 1)
     for tracker, out in zip(joint.trackers, observed, strict=True):
         own = Observations.empty(out.skeleton, out.times_ns[rows], 2)
@@ -269,9 +266,9 @@ def _put(
         for name in OF_COMPONENTS:
             getattr(own, name)[:, 2:] = getattr(out, name)[ways.anchor[:, None], of]
         own.n_px[:, 2:] = below.n_px[:, None]
-        seen = own.known[:, 2:].T
         lower = [
-            replace(one, found=there, crops=below) for one, there in zip(upper, seen, strict=True)
+            replace(one, found=there, crops=below)
+            for one, there in zip(upper, own.known[:, 2:].T, strict=True)
         ]
         poses += [own.pose(np.full(len(own), 2 + h)) for h in range(2)]
         tracker.put_agreement(own, [*upper, *lower], poses, cleared)

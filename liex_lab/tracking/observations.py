@@ -18,7 +18,7 @@ from liex_lab.body._skinning_kernels import place_joints
 from liex_lab.body.pose import KinematicTree, Pose
 from liex_lab.body.skeleton import Skeleton
 from liex_lab.geometry import SE3, so3
-from liex_lab.runtime.memory import Allocator, Rows, blocks
+from liex_lab.runtime.memory import Allocator, Rows, blocks, put
 from liex_lab.scene.height_maps import N_OBJECTS
 
 Small = NDArray[np.float32]
@@ -147,10 +147,8 @@ class Observations(Rows):
     def copied(self, allocate: Allocator) -> Observations:
         """The same observations in columns of their own, made by `allocate`."""
         columns: dict[str, Any] = {}
-        for name in COLUMNS:
-            values = getattr(self, name)
-            columns[name] = allocate(values.shape, values.dtype)
-            columns[name][:] = values
+        own = {name: getattr(self, name) for name in COLUMNS}
+        put(columns, slice(None), own, len(self), allocate)
         return replace(self, **columns)
 
     def forget(self, copies: NDArray[np.bool_]) -> None:

@@ -11,7 +11,7 @@ from liex_lab.geometry import SE3
 from liex_lab.plan import Plan
 from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.catalogue import film
-from liex_lab.tracking.covered import covered_stretches, look_again
+from liex_lab.tracking.covered import covered_stretches, measure_covered
 from liex_lab.tracking.identity import identify
 from liex_lab.tracking.joint import JointTracker
 from liex_lab.tracking.observations import COLUMNS, Observations
@@ -99,7 +99,7 @@ def test_an_animal_that_another_one_covers_is_held_where_it_lay(
     on_top = np.arange(ON_TOP.start, ON_TOP.stop) - rows.start
     assert np.isin(on_top, np.concatenate([some for some, _ in stretches])).all()
     for some, near in stretches:
-        look_again(joint, [frames[k] for k in some], some, near, seen, slots)
+        measure_covered(joint, [frames[k] for k in some], some, near, seen, slots)
     best = off_mm(recording, joint, rows, seen[0])[:, on_top]
     assert best[1, :, 0].max() < 12.0  # the upper one
     assert best[0, :, 1].max() < 10.0  # the lower one
