@@ -31,6 +31,7 @@ _NEARER = 0.5  # of the largest distance from the depth: what is nearer is not t
 _RAISED = 0.15  # how much higher than usual a raised animal is, in its usual heights
 _GOOD = 2.0  # residual of poses to hold, over the usual one
 _REACH = 2.0  # of animals that cover each other, from where they were in view, lengths
+_TWO = 1.2  # least volume of two animals, over that of the largest one
 _CHANGE = 0.3  # cost of another animal being the lower one
 _BOTH = 1.25  # cost with a pose of both over that with one, which it may have
 
@@ -151,25 +152,28 @@ def _ways(
     slots: Slots,
 ) -> _Ways:
     """All ways of explaining frames whose components are `crops` (some q rows)."""
-    q, n_animals = near.shape[0], slots.shape[1]
-    place = observed.centroid_mm[:, ::2, :2]
+    q, n_animals, place = len(near), slots.shape[1], observed.centroid_mm[:, ::2, :2]
     middles = np.full((len(crops.n_px), 3), np.inf)
     middles[crops.found] = joint.scene.middles(crops[crops.found], joint.camera_view)
-    middles = middles.reshape(-1, q, 3)[..., :2]
+    middles, volume = middles.reshape(-1, q, 3)[..., :2], crops.blobs.volume_mm3
+    least_mm3 = _TWO * max(
+        mm * body.scene.area_mm2 for mm, body in zip(joint.usual_mm, joint.bodies, strict=True)
+    )
     ways = []
     for i, (row, known) in enumerate(zip(rows, observed.known[rows, ::2], strict=True)):
-        there = np.flatnonzero(known)
+        there, missing = np.flatnonzero(known), np.flatnonzero(~known)
         off = np.linalg.norm(middles[:, i, None] - place[row, there], axis=-1)
-        of_blob, missing = off.argmin(axis=0), np.flatnonzero(~known)
         for anchor in near[i]:
             lay = place[anchor, slots[anchor]]
             for k in range(n_animals if anchor != NONE else 0):
                 blob = np.linalg.norm(middles[:, i] - lay[k], axis=-1).argmin()
-                pair = there[of_blob == blob]
+                pair = there[off.argmin(axis=0) == blob]
                 pair = np.append(pair, missing[:1]) if len(pair) == 1 else pair
                 away = np.linalg.norm(middles[blob, i] - lay, axis=-1) / joint.trackers[0].spine_mm
                 together = away[k] < 1.0 and (away < _REACH).sum() > 1 and len(pair) == 2
-                for body in range(len(joint.bodies)) if together else ():
+                # of several, the one without a pose may be somewhere else
+                two = n_animals == 2 or volume[blob * q + i] > least_mm3
+                for body in range(len(joint.bodies)) if together and two else ():
                     ways.append((i, anchor, k, body, blob * q + i, *pair))
     return _Ways(*np.array(ways, np.int64).reshape(-1, 7).T)
 
@@ -258,13 +262,14 @@ def _put(
     cleared = joint.scene.cleared(depths)
     below.n_px[:] = np.maximum(below.n_px, 1)
     to = 2 * np.stack([ways.over, ways.over, ways.under, ways.under], axis=1) + (0, 1, 0, 1)
-    of = 2 * held[:, None] + (0, 1)
     for tracker, out in zip(joint.trackers, observed, strict=True):
         own = Observations.empty(out.skeleton, out.times_ns[rows], 2)
         upper = tracker.estimator.both_directions([joint.candidates(tracker, tops)], tracker.size)
         poses = [tracker.put(own, h, one, depths) for h, one in enumerate(upper)]
         for name in OF_COMPONENTS:
-            getattr(own, name)[:, 2:] = getattr(out, name)[ways.anchor[:, None], of]
+            getattr(own, name)[:, 2:] = getattr(out, name)[
+                ways.anchor[:, None], 2 * held[:, None] + (0, 1)
+            ]
         own.n_px[:, 2:] = below.n_px[:, None]
         lower = [
             replace(one, found=there, crops=below)
