@@ -31,7 +31,7 @@ _NEARER = 0.5  # of the largest distance from the depth: what is nearer is not t
 _RAISED = 0.15  # how much higher than usual a raised animal is, in its usual heights
 _GOOD = 2.0  # residual of poses to hold, over the usual one
 _REACH = 2.0  # of animals that cover each other, from where they were in view, lengths
-_TWO = 1.2  # least volume of two animals, over that of the largest one
+_TWO = 1.1  # least volume of two animals, over that of the largest one
 _CHANGE = 0.3  # cost of another animal being the lower one
 _BOTH = 1.25  # cost with a pose of both over that with one, which it may have
 
@@ -155,10 +155,9 @@ def _ways(
     q, n_animals, place = len(near), slots.shape[1], observed.centroid_mm[:, ::2, :2]
     middles = np.full((len(crops.n_px), 3), np.inf)
     middles[crops.found] = joint.scene.middles(crops[crops.found], joint.camera_view)
-    middles, volume = middles.reshape(-1, q, 3)[..., :2], crops.blobs.volume_mm3
-    least_mm3 = _TWO * max(
-        mm * body.scene.area_mm2 for mm, body in zip(joint.usual_mm, joint.bodies, strict=True)
-    )
+    middles = middles.reshape(-1, q, 3)[..., :2]
+    largest_mm3 = max(joint.usual_mm * [body.scene.area_mm2 for body in joint.bodies])
+    two = (crops.blobs.volume_mm3 > _TWO * largest_mm3).reshape(-1, q)
     ways = []
     for i, (row, known) in enumerate(zip(rows, observed.known[rows, ::2], strict=True)):
         there, missing = np.flatnonzero(known), np.flatnonzero(~known)
@@ -171,9 +170,7 @@ def _ways(
                 pair = np.append(pair, missing[:1]) if len(pair) == 1 else pair
                 away = np.linalg.norm(middles[blob, i] - lay, axis=-1) / joint.trackers[0].spine_mm
                 together = away[k] < 1.0 and (away < _REACH).sum() > 1 and len(pair) == 2
-                # of several, the one without a pose may be somewhere else
-                two = n_animals == 2 or volume[blob * q + i] > least_mm3
-                for body in range(len(joint.bodies)) if together and two else ():
+                for body in range(len(joint.bodies)) if together and two[blob, i] else ():
                     ways.append((i, anchor, k, body, blob * q + i, *pair))
     return _Ways(*np.array(ways, np.int64).reshape(-1, 7).T)
 
@@ -208,16 +205,16 @@ def _on_top(
     """The upper animals, in the pixels `above` (w, S, S), and their bodies (w, S, S) mm.
 
     An animal on top of another one is measured from so far above the floor that its mean height is
-    the usual one.
+    the usual one. What is not raised is on the floor, and has no body here.
     """
     n_px = np.maximum(above.sum(axis=(1, 2)), 1)
     usual_mm = joint.usual_mm[bodies]
     up_mm = np.where(above, blobs.heights, 0).sum(axis=(1, 2)) / 16.0 / n_px - usual_mm
-    up_mm[up_mm < _RAISED * usual_mm] = 0.0
-    tops = joint.cut(blobs[np.arange(len(n_px))], above, up_mm)
+    raised = up_mm > _RAISED * usual_mm
+    tops = joint.cut(blobs[np.arange(len(n_px))], above, np.where(raised, up_mm, 0.0))
     drawn = np.zeros(blobs.heights.shape, np.float32)
     for k, body in enumerate(joint.bodies):
-        mine = np.flatnonzero((bodies == k) & tops.found & (tops.blobs.area_mm2 > joint.least_mm2))
+        mine = np.flatnonzero((bodies == k) & raised & (tops.blobs.area_mm2 > joint.least_mm2))
         own = np.zeros((len(mine), *drawn.shape[1:]), np.float32)
         joint.draw(body, tops[mine], own)
         drawn[mine] = own
