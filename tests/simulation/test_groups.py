@@ -5,11 +5,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from liex_lab.pipelines.evaluation.several import skin_gaps
+from scipy.spatial import cKDTree
 
 from liex_lab.recordings import open_recording
 from liex_lab.simulation.recording import RenderedRecording
 from liex_lab.simulation.scenes.groups import ENCOUNTERS, film_group
 from tests.recordings.asking import refusal
+
+
+def common(recording: RenderedRecording, frame: int) -> float:
+    """Share of the vertices of one of two bodies that lie in the other one."""
+    solids = [actor[frame : frame + 1].solids[0] for actor in recording.stage.actors]
+    shares = []
+    for one, other in (solids, solids[::-1]):
+        corners, points = one.vertices()[0][one.faces], other.vertices()[0]
+        outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        nearest = cKDTree(corners.mean(axis=1)).query(points)[1]
+        off = points - corners.mean(axis=1)[nearest]
+        shares.append(float((np.sum(off * outwards[nearest], axis=1) < 0).mean()))
+    return max(shares)
 
 
 def test_a_seed_gives_the_same_animals_acts_and_depth():
@@ -33,6 +47,7 @@ def test_lengths_are_equal_or_apart():
 @pytest.mark.parametrize("action", ["follow", "nose_to_nose", "mount", "huddle", "avoid"])
 def test_bodies_do_what_the_script_says(action):
     recording, acts = film_group(7, 600, encounters=(action,))
+    assert max(common(recording, i) for i in range(0, 600, 6)) < 0.3
     joints = [one.joints for one in recording.stage.actors]
     (agent, target, _, start, stop), *_ = [act for act in acts if act.action == action]
     middle = slice((2 * start + stop) // 3, (start + 2 * stop) // 3 + 1)

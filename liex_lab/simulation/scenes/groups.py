@@ -39,6 +39,7 @@ _WALKERS = ("side_by_side_opposite", "mount", "huddle")  # acts that swimmers do
 _HUNCH = 3  # of `pose_prior.KINDS`, the posture of animals that rest
 _AHEAD, _BEHIND = 0.5, 0.45  # from the body's centre to the nose and to the tail base, spines
 _ROOM_MM = 110.0  # between the centres of animals that pass each other
+_RAISED = 0.5  # nearest centres of one that mounts and is not raised, over both spines
 _CLIMB = 110.0 / _HZ  # per frame, of animals that swim
 ENCOUNTERS: Final = (
     "follow",
@@ -145,14 +146,15 @@ class Group:
     ) -> None:
         self.rng, self.deep, self.arena, self.spine, self.kind = rng, deep, arena, spines, kind
         self.acts: list[Act] = []
-        # of each frame (A, 6): x, y, heading, resting, mounting, height
+        # of each frame (A, 6): x, y, heading, resting, raised, height
         self.rows: list[Array] = []
         self.height = self.level = deep.uniform(*kind.water, len(spines))
         self.at = np.zeros((len(spines), 2))
         for i in range(len(spines)):
             self.at[i] = self._spot(i)
         self.way = rng.uniform(-np.pi, np.pi, len(spines))
-        self.resting, self.mounting = np.zeros((2, len(spines)))
+        self.resting = np.zeros(len(spines))
+        self.mounted = np.arange(len(spines))  # by each animal, itself if it mounts none
 
     def _spot(
         self, mover: int, apart_mm: float = 130.0, middle: Array = _AWAY, far_mm: float = 1.0
@@ -181,7 +183,9 @@ class Group:
     def frame(self) -> None:
         """Keep the present frame."""
         self.height = self.height + np.clip(self.level - self.height, -_CLIMB, _CLIMB)
-        state = (self.at, self.way, self.resting, self.mounting, self.height)
+        far = np.linalg.norm(self.at - self.at[self.mounted], axis=1)
+        raised = (far > 0) & (far < _RAISED * (self.spine + self.spine[self.mounted]))
+        state = (self.at, self.way, self.resting, raised, self.height)
         self.rows.append(np.column_stack(state))
 
     def dive(self, agent: int, target: int, action: str) -> None:
@@ -354,17 +358,17 @@ def _play(group: Group, agent: int, target: int, action: str) -> None:
         group.wait(0.5)
         group.act(agent, target, "nose_to_tail_base", begun)
         ride = group.at[target] + (0.45 * spines[agent] - 0.45 * other - 8.0) * group.ahead(target)
+        group.mounted[agent] = target
         group.walk(agent, ride, 120.0)
         begun = len(group.rows)
-        group.mounting[agent] = 1.0
     group.wait(seconds)
-    group.mounting[agent] = group.resting[[agent, target]] = 0.0
+    group.resting[[agent, target]] = 0.0
     group.act(agent, target, "nose_to_side" if action == "escape" else action, begun)
     if action == "huddle":  # they rest side by side
         group.act(agent, target, "side_by_side_same", begun)
-    group.wait(0.3 * (action == "mount"))
     leaver = target if action == "escape" or rng.random() < 0.3 or action == "mount" else agent
     _leave(group, leaver, agent + target - leaver, action == "escape")
+    group.mounted[agent] = agent  # it is down once the other one has gone from under it
 
 
 def _pursue(group: Group, agent: int, target: int, action: str, aside: float) -> None:
