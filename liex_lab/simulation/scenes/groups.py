@@ -268,7 +268,6 @@ def _meet(group: Group, agent: int, target: int, place: tuple[float, float], tur
     its frame, then stand at an angle `turn` to it; returns the frame of arrival.
     """
     every = range(len(group.at))
-    others = [k for k in every if k != agent]
     middle = group.arena.centre + group.rng.uniform(-25.0, 25.0, 2)
     for k in every:
         room = 150.0 if k == agent else 190.0
@@ -282,7 +281,7 @@ def _meet(group: Group, agent: int, target: int, place: tuple[float, float], tur
     goal = group.at[target] + place[0] * group.ahead(target) + place[1] * group.left(target)
     out = (goal - middle) / np.linalg.norm(goal - middle)
     start = goal + float(group.rng.uniform(90.0, 120.0)) * out
-    group.walk(agent, start, 180.0, others, near_mm=15.0)
+    group.walk(agent, start, 180.0, [k for k in every if k != agent], near_mm=15.0)
     group.face(agent, float(np.arctan2(-out[1], -out[0])))
     group.wait(0.2)
     begun, mm_s = len(group.rows), float(group.rng.uniform(110.0, 220.0))
@@ -420,13 +419,12 @@ def _shun(group: Group, agent: int, target: int) -> None:
     goal = group.at[agent] + 160.0 * away / np.linalg.norm(away)
     if group.arena.freedom(goal) < 40.0:
         goal = group._spot(agent, 200.0)
-    begun = 0
+    begun = len(group.rows) + 15
     for i in range(int(1.3 * _HZ)):
         turn = np.arctan2(*(goal - group.at[agent])[::-1]) - group.way[agent]
         if i < 15:  # it turns away
             group.way[agent] += np.clip((turn + np.pi) % (2 * np.pi) - np.pi, -_TURN, _TURN)
         else:
-            begun = begun or len(group.rows)
             group.step(agent, goal, 210.0, [target])
         group.step(target, group.at[agent].copy(), 110.0)
         group.frame()
@@ -471,8 +469,9 @@ class _Making(Making):
             else (lambda rng, n: (kinds, speed)),
             lambda rng, scene, spine_mm, mm_s: (place, heading),
         )
-        risen = smoothed(path[:, 4], 4.0)
-        return animal if kind.swims else _risen(_aligned(animal, heading), risen)
+        return (
+            animal if kind.swims else _risen(_aligned(animal, heading), smoothed(path[:, 4], 4.0))
+        )
 
 
 def _aligned(animal: Actor, heading: Array) -> Actor:
@@ -537,10 +536,11 @@ def film_group(
     base = (spine_mm or float(rng.uniform(*kind.lengths_mm))) / kind.unit
     spines = base * (1.0 + apart) ** -np.arange(animals, dtype=float)
     arena = Making(kind.recipe, seed, take)._arenas()[0]
-    T = arena.T_arena_camera
     arena = replace(
         arena,
-        T_arena_camera=SE3(T.rotation, T.translation / kind.unit),
+        T_arena_camera=SE3(
+            arena.T_arena_camera.rotation, arena.T_arena_camera.translation / kind.unit
+        ),
         centre=arena.centre / kind.unit,
         half=arena.half / kind.unit,
     )
