@@ -91,7 +91,8 @@ class JointTracker:
         if not len(images[0]):
             raise EstimationError(
                 f"animal.count is {n_animals}, but hardly a frame of a sample shows as many "
-                "animals apart; correct the number, or set animal.count to 'auto'"
+                "animals apart (one that rests almost throughout is taken for the background); "
+                "correct the number, or set animal.count to 'auto'"
             )
         smaller = -np.diff(np.log(size), axis=0)
         least = np.maximum(_SAME_SIZE, _CHANCE * smaller.std(axis=1))
